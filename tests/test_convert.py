@@ -30,6 +30,9 @@ LIMIT_PX = 1e-6
 
 
 def model_of(tmp_path: Path, capture: Capture) -> Path:
+    """Write a model, and pictures beside it if there are none."""
+    if not any(frame.has_photo for frame in capture.frames):
+        photograph(with_photos(capture, tmp_path / "images").frames)
     write_colmap_binary(capture, tmp_path / "in")
     return tmp_path / "in"
 
@@ -117,14 +120,12 @@ def test_colmap_to_a_format_and_back_moves_no_pixel(form, tmp_path):
     report = json.loads(there.stdout)
     assert report["read_back"]["max_px"] < LIMIT_PX
     assert report["read_back"]["rays"] > 100
-    more = []
+    more = ["--images", tmp_path / "images"]
     if form in ("tum", "kitti"):
         one = {"model": "PINHOLE", "width": 640, "height": 480, "params": PINHOLE.params}
         (tmp_path / "camera.json").write_text(json.dumps(one))
         more = ["--intrinsics", tmp_path / "camera.json"]
         capture = replace(capture, frames=tuple(replace(frame, camera=PINHOLE) for frame in capture.frames))
-    if form in ("llff", "blender"):
-        more = ["--images", tmp_path / "images"]
     back = nerfcli("convert", report["path"], tmp_path / "back", "--to", "colmap", "--allow-loss", *more)
     assert back.exit_code == 0, back.stderr
     _, _, again = load(tmp_path / "back", UserInputs(), ConventionOverrides())
@@ -164,6 +165,7 @@ def test_a_convention_that_the_format_fixes_is_refused(form, options, message, t
 
 def test_a_file_that_holds_the_inverse_is_read_so(tmp_path):
     capture = capture_of([PINHOLE])
+    photograph(with_photos(capture, tmp_path).frames)
     content = {"w": 640, "h": 480, "fl_x": 500.0, "fl_y": 505.0, "cx": 321.25, "cy": 238.5, "frames": []}
     for frame in capture.frames:
         matrix = np.linalg.inv(frame.world_from_cam).tolist()
@@ -370,6 +372,7 @@ def test_what_is_in_the_way_is_kept(out, form, more, message, tmp_path):
 
 
 def test_many_captures_each_under_its_name(tmp_path):
+    photograph(with_photos(capture_of([PINHOLE]), tmp_path / "images").frames)
     for name in ("one", "two"):
         write_colmap_binary(capture_of([PINHOLE]), tmp_path / name)
     lines = f"{tmp_path / 'one'}\n{tmp_path / 'three'}\n{tmp_path / 'two'}\n"

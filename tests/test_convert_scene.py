@@ -305,10 +305,10 @@ def test_photos_in_several_folders_get_their_paths_for_names(tmp_path):
 
 def test_views_without_photos_make_no_scene(tmp_path):
     capture = capture_of([PINHOLE])
-    source = model_of(tmp_path, capture)
-    result = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli")
+    write_colmap_binary(capture, tmp_path / "in")
+    result = nerfcli("convert", tmp_path / "in", tmp_path / "scene", "--to", "nerfcli")
     assert result.exit_code == BAD_INPUT
-    assert "photo 00.png has no photo" in error_of(result)[0]
+    assert "none of the 6 photos of the capture is on disk, such as photo 00.png" in error_of(result)[0]
     gone = replace(capture, frames=tuple(replace(f, image=tmp_path / "gone" / f.name) for f in capture.frames))
     with pytest.raises(UserError, match="none of the 6 photos exists"):
         made_scene(gone, tmp_path / "scene")

@@ -72,6 +72,7 @@ def test_poses_are_world_from_camera_by_rows_and_names_are_relative(tmp_path):
     poses = [frame.world_from_cam for frame in capture.frames]
     np.testing.assert_allclose(poses, rigid.from_parts(ROTATIONS, CENTRES), rtol=0, atol=1e-15)
     assert (capture.kind, capture.unit, len(capture.points)) == ("alicevision", "arbitrary", 0)
+    (tmp_path / "photos").mkdir()
     elsewhere = parse_alicevision(write(tmp_path, content()), images=tmp_path / "photos")
     assert [frame.image for frame in elsewhere.frames] == [
         tmp_path / "photos/day 1/a.jpg",

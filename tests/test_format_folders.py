@@ -112,11 +112,11 @@ def test_other_names_of_folders_and_files_give_the_same_capture(tmp_path, name, 
         assert (frame.mask is None) == (usual_frame.mask is None)
 
 
-def test_of_photos_that_differ_only_in_suffix_the_first_is_used(tmp_path):
+def test_photos_that_differ_only_in_suffix_are_refused(tmp_path):
     write("record3d", tmp_path)
-    photo(tmp_path / "rgb/1.jpeg")
     photo(tmp_path / "rgb/1.png")
-    assert [frame.name for frame in parse(tmp_path)[1].frames] == ["0.jpg", "1.jpeg", "2.jpg"]
+    with pytest.raises(UserError, match=r"1: both rgb/1\.(png|jpg) and rgb/1\.(png|jpg) fit this name"):
+        parse(tmp_path)
 
 
 class TestPoseFiles:

@@ -16,10 +16,6 @@ from nerfcli.captures.formats.npy import array_of_npy
 from nerfcli.errors import UserError
 
 
-def list_files(folder: Path) -> list[Path]:
-    return sorted(folder.iterdir())
-
-
 def pinhole_ring() -> Capture:
     return ring(Camera.pinhole(640, 480, 500.0), Camera.pinhole(400, 480, 450.0))
 
@@ -30,7 +26,7 @@ def test_a_written_array_is_read_back(tmp_path):
     rows = np.load(tmp_path / "poses_bounds.npy")
     assert rows.shape == (6, 17)
     np.testing.assert_array_equal(rows[:, [4, 9, 14]], [[480, 640, 500], [480, 400, 450]] * 3)
-    back = parse_llff(tmp_path, list_files)
+    back = parse_llff(tmp_path)
     assert reprojection_px(capture, back) < 1e-10
     np.testing.assert_array_equal(back.depth_bounds, capture.depth_bounds)
     assert [frame.name for frame in back.frames] == [f"image{index:03d}" for index in range(6)]
@@ -38,7 +34,7 @@ def test_a_written_array_is_read_back(tmp_path):
     (tmp_path / "images").mkdir()
     for frame in capture.frames:
         (tmp_path / "images" / Path(frame.name).name).write_bytes(b"")
-    back = parse_llff(tmp_path, list_files)
+    back = parse_llff(tmp_path)
     assert [frame.image for frame in back.frames] == sorted((tmp_path / "images").iterdir())
     assert back.frames[0].name == "images/ä 00.jpg"
 

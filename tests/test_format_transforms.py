@@ -78,6 +78,8 @@ def test_images_masks_splits_and_cameras_per_image(tmp_path):
     splits = ("train", "train", "val", "test", "train", "test")
     frames = [replace(frame, split=split) for frame, split in zip(capture.frames, splits, strict=True)]
     frames[1] = replace(frames[1], mask=tmp_path / "masks/ö.png")
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks/ö.png").write_bytes(b"")
     capture = replace(capture, frames=tuple(frames))
     assert capture.observations is not None
     assert losses_transforms(capture) == (f"{len(capture.observations.pixels)} observations",)

@@ -126,7 +126,6 @@ def test_rounded_poses_become_exactly_rigid(tmp_path):
         ({"frames": [entry("a.png"), {"transform_matrix": OPENGL_POSE}]}, r"frames\[1\]: file_path is None"),
         ({"frames": [entry("a.png"), entry("./a.png")]}, "a.png is listed twice"),
         ({"frames": [entry("x.png"), entry("y.png")]}, r"none of its 2 photos is on disk, such as .*x\.png"),
-        ({"frames": [entry("a.png", mask_path="m.png")]}, r"m\.png, the mask of a\.png, does not exist"),
         ({"fl_x": "wide"}, "fl_x is 'wide'"),
         ({"fl_x": -3}, "fl_x is -3.0"),
         ({"fl_x": None, "fl_y": None}, "neither fl_x nor camera_angle_x"),

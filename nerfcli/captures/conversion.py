@@ -15,7 +15,6 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.captures.axes import Convention, expressed, opencv_from_axes, poses_of, reinterpreted
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.format import Format, UserInputs
-from nerfcli.captures.formats.photo_names import with_photos
 from nerfcli.captures.formats.registry import recognise, with_masks
 from nerfcli.captures.stored_pixels import STORED, UPRIGHT, ReorientedCapture, in_pixels
 from nerfcli.errors import GATE_NOT_MET, UserError
@@ -144,8 +143,6 @@ def load(source: Path, given: UserInputs, overrides: ConventionOverrides) -> tup
     """
     form, found = recognise(source)
     capture = form.parse(found, given)
-    if given.images is not None:
-        capture = with_photos(capture, given.images)
     if given.masks is not None:
         capture = with_masks(capture, given.masks)
     true_convention = Convention(

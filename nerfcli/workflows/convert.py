@@ -12,7 +12,7 @@ from nerfcli.captures.formats.registry import recording
 from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.captures.stored_pixels import STORED, in_pixels, other_sizes
 from nerfcli.captures.world_frame import WorldFrame, in_world_frame
-from nerfcli.errors import several
+from nerfcli.errors import UserError, listed, several
 from nerfcli.notices import Reporter
 from nerfcli.photos.images import HEIC_SUFFIXES
 
@@ -40,6 +40,10 @@ def convert_capture(
     to = wanted.form.name
     form, found, capture = load(source, given, overrides)
     reporter.note(f"{found}: {form.name}, {contents(capture)}")
+    for text in capture.notes:
+        reporter.warn(text)
+    if "cameras" not in wanted.form.lacks and ("cameras" not in form.lacks or given.images is not None):
+        _report_missing(capture, reporter)
     for text in describe_rescaling(other_sizes(capture)):
         reporter.note(f"{text.removesuffix(': rescaled')}; written to {to} unchanged")
     if text := _describe_outside(capture):
@@ -67,6 +71,23 @@ def convert_capture(
     if done.loss_px > TOLERANCE_PX:
         reporter.warn(f"dropping lens parameters shifts pixels by up to {done.loss_px:.3g} px")
     return done, _record(done, to) | frame
+
+
+def _report_missing(capture: Capture, reporter: Reporter) -> None:
+    """Name the photos that are not on disk.
+
+    Raises:
+        UserError: none is.
+    """
+    missing = [*(frame.name for frame in capture.frames if not frame.has_photo), *capture.missing]
+    count = len(capture.missing) + len(capture.frames)
+    if len(missing) == count:
+        raise UserError(
+            f"none of the {several(count, 'photo')} of the capture is on disk, such as {missing[0]}",
+            "give their folder with --images; poses without photos can be written with --to tum",
+        )
+    if missing:
+        reporter.warn(f"{len(missing)} of {several(count, 'photo')} missing: {listed(missing)}")
 
 
 def _describe_outside(capture: Capture) -> str | None:
@@ -98,6 +119,8 @@ def detect_convention(
     """
     form, found, capture = load(source, given, overrides)
     reporter.note(f"{found}: {form.name}, {contents(capture)}")
+    for text in capture.notes:
+        reporter.warn(text)
     return form, detect.detect(in_pixels(capture, STORED).capture, axes=form.axes, progress=reporter.progress)
 
 

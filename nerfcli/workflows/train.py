@@ -129,6 +129,8 @@ def train_scene(
 def _describe(folder: Path, scene: Capture, reporter: Reporter) -> None:
     """Tell what was loaded, and what was left out."""
     reporter.note(describe_source(folder, scene))
+    for text in scene.notes:
+        reporter.warn(text)
     if scene.missing:
         reporter.warn(f"{several(len(scene.missing), 'missing photo')} of {folder} skipped: {listed(scene.missing)}")
     for text in describe_rescaling(scene.rescaled):

@@ -9,9 +9,9 @@ and the principal point is relative to the middle of the picture from 1.2.1 on, 
 Source: alicevision/AliceVision src/aliceVision: sfmDataIO/jsonIO.cpp, camera/cameraCommon.hpp, DistortionBrown.cpp.
 """
 
-import os
 import posixpath
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from nerfcli.captures.formats.fields import (
 )
 from nerfcli.captures.formats.format import Format, by_suffix, has_keys
 from nerfcli.captures.formats.limits import rigid_pose
+from nerfcli.captures.formats.photo_names import find_photos
 
 FILES = ("cameras.sfm", "sfm.sfm", "sfm.json")
 
@@ -82,14 +83,15 @@ def parse_alicevision(path: Path, *, images: Path | None = None) -> Capture:
             continue
         if not isinstance(camera, str) or camera not in cameras:
             raise malformed(where, f"intrinsicId is {shown(camera)}", "expected the id of one of the intrinsics")
-        name = place.removeprefix(folder)
-        image = images / name if images is not None else Path(place)
-        if images is None and not (image.is_absolute() and os.path.isfile(image)):
-            image = path.parent / name
-        frames.append(Frame(name, cameras[camera], poses[pose], image=image))
+        frames.append(Frame(place, cameras[camera], poses[pose]))
     check_unique_names((frame.name for frame in frames), path)
+    sizes = [frame.camera.size for frame in frames]
+    found = find_photos([frame.name for frame in frames], (path.parent,), given=images, sizes=sizes)
+    for index, (frame, image) in enumerate(zip(frames, found.paths, strict=True)):
+        name = frame.name.removeprefix(folder)
+        frames[index] = replace(frame, name=name, image=image or (images or path.parent) / name)
     points, colours = _points(content.get("structure", []), f"{path}: structure")
-    return Capture(tuple(frames), points, (), None, "alicevision", colours=colours)
+    return Capture(tuple(frames), points, (), None, "alicevision", colours=colours, notes=found.notes)
 
 
 def _identified(records: list[Any], key: str, where: str) -> Iterator[tuple[str, dict[str, Any], str]]:

@@ -46,19 +46,20 @@ def parse_blender(
     Raises:
         UserError: a file is malformed or lists no image that is on disk, or there is no file.
     """
-    frames, missing = list[Frame](), list[str]()
+    frames, missing, notes = list[Frame](), list[str](), list[str]()
     for split in SPLITS:
         path = _file(folder, split)
         if path.exists():
             size = camera.size if camera else frames[0].camera.size if frames else None
             content = read_json_object(path)
-            listed, unknown = listed_frames(path, content, measure, suffix=".png", images=images, size=size)
+            listed, unknown, said = listed_frames(path, content, measure, suffix=".png", images=images, size=size)
             frames += [replace(frame, split=split) for frame in listed]
             missing += unknown
+            notes += said
     if not frames:
         raise UserError(f"{_file(folder, 'train')}: No such file", "give a folder of transforms_{train,val,test}.json")
     check_unique_names(folder, frames)
-    return Capture(tuple(frames), np.zeros((0, 3)), tuple(missing), None, "blender")
+    return Capture(tuple(frames), np.zeros((0, 3)), tuple(missing), None, "blender", notes=tuple(notes))
 
 
 def losses_blender(capture: Capture) -> tuple[str, ...]:

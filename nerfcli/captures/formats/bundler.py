@@ -21,8 +21,8 @@ from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, name_of, numbers, read_text
 from nerfcli.captures.formats.format import Format, by_suffix, only_file
 from nerfcli.captures.formats.limits import rigid_pose
-from nerfcli.captures.formats.photo_names import measured_sizes
-from nerfcli.captures.orientation import Measure
+from nerfcli.captures.formats.photo_names import find_photos
+from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
 
 BEGINS = "# Bundle file"
@@ -64,19 +64,26 @@ def parse_bundler(
         )
     registered = [index for index in range(num_cameras) if numbers(*_line(lines, 1 + 5 * index, 3, path))[0] != 0]
     check_unique_names((names[index] for index in registered), image_list if registered else path)
-    found, missing = measured_sizes([names[index] for index in registered], images or image_list.parent, measure, path)
+    found = find_photos([names[index] for index in registered], (image_list.parent,), given=images)
+    found = found.required(str(path), "the file does not give their sizes")
     frames, middles = [], []
     index_of_camera = np.full(num_cameras, -1, dtype=np.int64)
-    for index in registered:
-        if names[index] in found:
-            size, image = found[names[index]]
+    for index, name, image in zip(registered, found.names, found.paths, strict=True):
+        if image is not None:
+            size = stored_size(image, measure)
             index_of_camera[index] = len(frames)
-            frames.append(_frame(names[index], lines[1 + 5 * index : 6 + 5 * index], size, image, path))
+            frames.append(_frame(name, lines[1 + 5 * index : 6 + 5 * index], size, image, path))
             middles.append((size[0] / 2, size[1] / 2))
     points, colours, views = _points(lines[1 + 5 * num_cameras :], num_cameras, num_points, path)
     seen = _observations(views, index_of_camera, np.array(middles))
     return Capture(
-        tuple(frames), points, missing, None, "bundler", colours=colours if num_points else None, observations=seen
+        tuple(frames),
+        points,
+        found.missing,
+        kind="bundler",
+        colours=colours if num_points else None,
+        observations=seen,
+        notes=found.notes,
     )
 
 

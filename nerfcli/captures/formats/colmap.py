@@ -10,7 +10,6 @@ Source: colmap.github.io/format.html; colmap src/colmap/scene/reconstruction_io_
 import struct
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,7 +19,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import colmap_binary, colmap_text
 from nerfcli.captures.formats.colmap_model import ColmapImage, ColmapModel, capture_of, model_of
 from nerfcli.captures.formats.format import Format
-from nerfcli.captures.formats.photo_names import IMAGE_FOLDERS
+from nerfcli.captures.formats.photo_names import with_photos
 from nerfcli.captures.formats.unsupported import lost_parts
 from nerfcli.errors import UserError
 
@@ -62,20 +61,8 @@ def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
 
 
 def parse_model(model_dir: Path, *, images: Path | None = None) -> Capture:
-    """Read a COLMAP model, with its photos in the folder that contains most of its names.
-
-    The folders tried are the given one (`images`); or images/ and the like in the model's folder or up to three folders
-    above it, then these folders themselves, as names may include the image folder.
-    """
-    capture = parse_colmap(model_dir)
-    homes = (model_dir, *model_dir.resolve().parents[:3])
-    folders = [home / name for home in homes for name in IMAGE_FOLDERS if (home / name).is_dir()]
-    places = [*folders, *homes] if images is None else [images]
-    counts = [sum((place / frame.name).is_file() for frame in capture.frames) for place in places]
-    best = places[counts.index(max(counts))] if any(counts) else next(iter(folders), None)
-    if best is None:
-        return capture
-    return replace(capture, frames=tuple(replace(frame, image=best / frame.name) for frame in capture.frames))
+    """Read a COLMAP model, with its photos in the given folder, or in the model's folder or up to three above it."""
+    return with_photos(parse_colmap(model_dir), model_dir, *model_dir.resolve().parents[:3], given=images)
 
 
 def read_model(model_dir: Path) -> ColmapModel:

@@ -6,7 +6,7 @@ the sorted file names. Source: Fyusion/LLFF README, "Using your own poses withou
 llff/poses/pose_utils.py, save_poses.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,34 +20,35 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.format import Format, folder_of
 from nerfcli.captures.formats.limits import checked_camera, plausible, rigid_poses
 from nerfcli.captures.formats.npy import DAMAGED, array_of_npy
-from nerfcli.captures.formats.photo_names import IMAGE_FOLDERS, ListImages
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
 from nerfcli.errors import UserError
 from nerfcli.photos.images import list_images
 
 FILE = "poses_bounds.npy"
+# Folders of photos, in the order of preference; the numbers are factors of reduction.
+IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 
 # Percentiles of the depths of a view's points that give its depth bounds. Source: pose_utils.py, save_poses.
 _NEAR_PERCENT, _FAR_PERCENT = 0.1, 99.9
 
 
-def parse_llff(folder: Path, list_images: ListImages) -> Capture:
+def parse_llff(folder: Path, *, images: Path | None = None) -> Capture:
     """Read poses_bounds.npy; cameras are for the full-size photos.
 
-    The file does not name the photos. They are those of the first image folder that holds one per row. If there is no
-    image folder at all, frames are named image000, image001, ... and have no image.
+    The file does not name the photos. They are those of `images`, or of the first image folder that holds one per row.
+    If there is no image folder at all, frames are named image000, image001, ... and have no image.
 
     Raises:
         UserError: the array is damaged or of another shape, or image folders hold other numbers of images.
     """
     path = folder / FILE
     rows = _read_rows(path)
-    images: list[Path] | list[None] = [None] * len(rows)
-    if any((folder / name).is_dir() for name in IMAGE_FOLDERS):
-        images = _images_of_rows(folder, len(rows), list_images)
+    places = [place for place in (folder / name for name in IMAGE_FOLDERS) if place.is_dir()]
+    places = places if images is None else [images]
+    photos = _photos_of_rows(path, len(rows), places) if places else [None] * len(rows)
     frames = [
         Frame(f"image{index:03d}" if image is None else _name(image), camera, world_from_cam, image=image)
-        for index, (image, (camera, world_from_cam)) in enumerate(zip(images, _views(path, rows), strict=True))
+        for index, (image, (camera, world_from_cam)) in enumerate(zip(photos, _views(path, rows), strict=True))
     ]
     return Capture(tuple(frames), np.zeros((0, 3)), (), rows[:, 15:].copy(), "llff")
 
@@ -114,18 +115,15 @@ def _views(path: Path, rows: np.ndarray) -> list[tuple[Camera, np.ndarray]]:
     return [(cameras[row], pose) for row, pose in zip(numbers, poses, strict=True)]
 
 
-def _images_of_rows(folder: Path, count: int, list_images: ListImages) -> list[Path]:
+def _photos_of_rows(path: Path, count: int, folders: Sequence[Path]) -> Sequence[Path]:
     found = []
-    for name in IMAGE_FOLDERS:
-        if not (folder / name).is_dir():
-            continue
-        images = list_images(folder / name)
-        if len(images) == count:
-            return images
-        found.append(f"{name}/ has {len(images)}")
+    for folder in folders:
+        photos = list_images(folder)
+        if len(photos) == count:
+            return photos
+        found.append(f"{folder.name}/ has {len(photos)}")
     raise UserError(
-        f"{folder / FILE} has {count} rows, but {', '.join(found) or 'the folder images/ is missing'}",
-        "there must be exactly one photo per row, sorted by name",
+        f"{path} has {count} rows, but {', '.join(found)}", "there must be exactly one photo per row, sorted by name"
     )
 
 
@@ -184,7 +182,7 @@ FORMAT = Format(
     "poses_bounds.npy",
     "poses_bounds.npy",
     folder_of(FILE),
-    lambda path, given: parse_llff(path, list_images),
+    lambda path, given: parse_llff(path, images=given.images),
     axes="llff",
     open_axes=True,
     files=("poses_bounds.npy",),

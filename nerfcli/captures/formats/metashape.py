@@ -27,7 +27,7 @@ from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, numbers, shown, size_of
 from nerfcli.captures.formats.format import Format, by_suffix
 from nerfcli.captures.formats.limits import rigid_pose
-from nerfcli.captures.formats.photo_names import IMAGE_FOLDERS, with_photos
+from nerfcli.captures.formats.photo_names import with_photos
 
 Element = ElementTree.Element
 
@@ -203,7 +203,5 @@ FORMAT = Format(
     "Agisoft Metashape",
     ".xml",
     by_suffix(".xml", "cameras.xml"),
-    lambda path, given: with_photos(
-        parse_metashape(path), *(path.parent / name for name in IMAGE_FOLDERS), path.parent
-    ),
+    lambda path, given: with_photos(parse_metashape(path), path.parent, given=given.images),
 )

@@ -22,10 +22,9 @@ from nerfcli.captures.formats.fields import check_unique_names, malformed, numbe
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.lenses import camera_of_matrix
 from nerfcli.captures.formats.limits import rigid_pose
-from nerfcli.captures.formats.photo_names import ListImages, PhotoOfStem
+from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
-from nerfcli.photos.images import list_images
 
 CAMERA_FOLDER = "cams"
 CAMERA_FILES = "*_cam.txt"
@@ -34,7 +33,7 @@ IMAGE_FOLDERS = ("images", "blended_images")
 _EXPECTED = "expected the word extrinsic, 16 numbers, the word intrinsic, 9 numbers, and a line of 2 to 4 depths"
 
 
-def parse_mvsnet(folder: Path, measure: Measure, list_images: ListImages, *, images: Path | None = None) -> Capture:
+def parse_mvsnet(folder: Path, measure: Measure, *, images: Path | None = None) -> Capture:
     """Read the cameras in cams/, with their depth bounds where all files have them.
 
     The photos are in `images`, by default images/ or blended_images/.
@@ -42,19 +41,20 @@ def parse_mvsnet(folder: Path, measure: Measure, list_images: ListImages, *, ima
     Raises:
         UserError: a file is damaged (it is named), or no photo is on disk.
     """
-    photos = PhotoOfStem(images, list_images, home=folder, names=IMAGE_FOLDERS)
+    files = sorted((folder / CAMERA_FOLDER).glob(CAMERA_FILES))
+    stems = [file.name.removesuffix(CAMERA_FILES[1:]) for file in files]
+    photos = find_photos(stems, (folder,), given=images, folders=IMAGE_FOLDERS)
+    photos = photos.required(str(folder), "they give the names")
     frames, bounds = [], []
-    for file in sorted((folder / CAMERA_FOLDER).glob(CAMERA_FILES)):
+    for file, image in zip(files, photos.paths, strict=True):
         cam_from_world, matrix, depths = _read(file)
-        image = photos.find(file.name.removesuffix(CAMERA_FILES[1:]))
         if image is not None:
             camera = camera_of_matrix(matrix, stored_size(image, measure), f"{file}: intrinsic")
             frames.append(Frame(image.name, camera, rigid.inverse(cam_from_world), image=image))
             bounds.append(depths)
-    missing = photos.missing(str(folder))
     check_unique_names((frame.name for frame in frames), folder)
     known = np.array(bounds) if None not in bounds else None
-    return Capture(tuple(frames), np.zeros((0, 3)), missing, known, "mvsnet")
+    return Capture(tuple(frames), np.zeros((0, 3)), photos.missing, known, "mvsnet", notes=photos.notes)
 
 
 def _read(file: Path) -> tuple[np.ndarray, np.ndarray, tuple[float, float] | None]:
@@ -86,5 +86,5 @@ FORMAT = Format(
     "cams/ of MVSNet, BlendedMVS",
     "cams/",
     find_mvsnet,
-    lambda path, given: parse_mvsnet(path, measure, list_images, images=given.images),
+    lambda path, given: parse_mvsnet(path, measure, images=given.images),
 )

@@ -21,7 +21,7 @@ from nerfcli.captures.formats.format import Format, named
 from nerfcli.captures.formats.lenses import camera_of_matrix
 from nerfcli.captures.formats.limits import plausible
 from nerfcli.captures.formats.npy import DAMAGED, array_of_npy, members_of_npz
-from nerfcli.captures.formats.photo_names import GIVE_PHOTOS, ListImages
+from nerfcli.captures.formats.photo_names import GIVE_PHOTOS
 from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import UserError
@@ -38,7 +38,7 @@ _SINGULAR = 1e-9
 _ROUNDING_PX = 0.01
 
 
-def parse_neus(path: Path, measure: Measure, list_images: ListImages, *, images: Path | None = None) -> Capture:
+def parse_neus(path: Path, measure: Measure, *, images: Path | None = None) -> Capture:
     """Read the cameras of the file, in its world; the photos are those beside it, in order.
 
     Args:
@@ -48,8 +48,8 @@ def parse_neus(path: Path, measure: Measure, list_images: ListImages, *, images:
         UserError: the file is damaged (the array is named), or has another number of cameras than there are photos.
     """
     members = members_of_npz(path)
-    photos = _pictures(path.parent, (images,) if images else IMAGE_FOLDERS, list_images)
-    masks = _pictures(path.parent, MASK_FOLDERS, list_images)
+    photos = _pictures(path.parent, (images,) if images else IMAGE_FOLDERS)
+    masks = _pictures(path.parent, MASK_FOLDERS)
     count = 0
     while f"world_mat_{count}" in members:
         count += 1
@@ -77,7 +77,7 @@ def _without_rounding(matrices: np.ndarray) -> np.ndarray:
     return np.broadcast_to(shared, matrices.shape) if same else matrices
 
 
-def _pictures(folder: Path, names: tuple[str | Path, ...], list_images: ListImages) -> list[Path]:
+def _pictures(folder: Path, names: tuple[str | Path, ...]) -> list[Path]:
     """Return the pictures in the first of these folders that there is."""
     place = next((folder / name for name in names if (folder / name).is_dir()), None)
     return [] if place is None else list_images(place)
@@ -128,5 +128,5 @@ FORMAT = Format(
     "projections of IDR, NeuS",
     ".npz",
     find_neus,
-    lambda path, given: parse_neus(path, measure, list_images, images=given.images),
+    lambda path, given: parse_neus(path, measure, images=given.images),
 )

@@ -34,6 +34,7 @@ from nerfcli.captures.formats.fields import (
 )
 from nerfcli.captures.formats.format import Format, find_json
 from nerfcli.captures.formats.limits import checked_camera, plausible
+from nerfcli.captures.formats.photo_names import with_photos
 from nerfcli.captures.formats.unsupported import distortion, lost_of_cameras, lost_parts, projection
 from nerfcli.errors import UserError
 
@@ -262,7 +263,7 @@ FORMAT = Format(
     "OpenSfM, OpenDroneMap",
     "reconstruction.json",
     lambda path: find_json(path, opening="[", name="reconstruction.json"),
-    lambda path, given: parse_opensfm(path),
+    lambda path, given: with_photos(parse_opensfm(path), path.parent, given=given.images),
     default_name="reconstruction.json",
     files=("*.json",),
     write=write_opensfm,

@@ -17,8 +17,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, number, read_json_object, size_of
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.limits import checked_camera, rigid_pose
-from nerfcli.captures.formats.photo_names import ListImages, PhotoOfStem
-from nerfcli.photos.images import list_images
+from nerfcli.captures.formats.photo_names import find_photos
 
 FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 KEYFRAMES = "keyframes"
@@ -33,7 +32,7 @@ def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
     return next((pair for pair in pairs if pair[1].is_dir()), pairs[0] if pairs else None)
 
 
-def parse_polycam(folder: Path, list_images: ListImages, *, images: Path | None = None) -> Capture:
+def parse_polycam(folder: Path, *, images: Path | None = None) -> Capture:
     """Read the keyframes of a capture; the unit is the metre, by LiDAR.
 
     The photos are in the folder beside the cameras, or in `images`.
@@ -43,20 +42,30 @@ def parse_polycam(folder: Path, list_images: ListImages, *, images: Path | None 
     """
     found = polycam_folders(folder)
     assert found is not None
-    photos, frames = PhotoOfStem(images, list_images, home=found[1]), []
+    stems, views = [], []
     for file in sorted(found[0].glob("*.json"), key=lambda file: (len(file.stem), file.stem)):
         where, record = str(file), read_json_object(file)
         fx, fy, cx, cy, *pose = (number(record, key, where) for key in ("fx", "fy", "cx", "cy", *_POSE))
         size = size_of(number(record, "width", where), number(record, "height", where), where)
         camera = checked_camera("PINHOLE", *size, (fx, fy, cx, cy), where=where)
-        image = photos.find(file.stem)
-        if image is not None:
-            world_from_cam = opencv_from_opengl_pose(rigid_pose(np.array(pose).reshape(3, 4), where))
-            frames.append(Frame(image.name, camera, world_from_cam, image=image))
-    missing = photos.missing(str(folder))
+        stems.append(file.stem)
+        views.append((camera, opencv_from_opengl_pose(rigid_pose(np.array(pose).reshape(3, 4), where))))
+    sizes = [camera.size for camera, _ in views]
+    photos = find_photos(stems, (found[1],), given=images, sizes=sizes).required(str(folder), "they give the names")
+    frames = [
+        Frame(image.name, camera, pose, image=image)
+        for image, (camera, pose) in zip(photos.paths, views, strict=True)
+        if image is not None
+    ]
     check_unique_names((frame.name for frame in frames), folder)
     return Capture(
-        tuple(frames), np.zeros((0, 3)), missing, None, "polycam", unit="metre", unit_source="LiDAR (Polycam)"
+        tuple(frames),
+        np.zeros((0, 3)),
+        photos.missing,
+        kind="polycam",
+        unit="metre",
+        unit_source="LiDAR (Polycam)",
+        notes=photos.notes,
     )
 
 
@@ -71,6 +80,6 @@ FORMAT = Format(
     "raw data of Polycam",
     "keyframes/",
     find_polycam,
-    lambda path, given: parse_polycam(path, list_images, images=given.images),
+    lambda path, given: parse_polycam(path, images=given.images),
     axes="opengl",
 )

@@ -13,6 +13,7 @@ Source: ScanNet SensReader; Microsoft 7-Scenes readme.txt; facebookresearch/NSVF
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +25,10 @@ from nerfcli.captures.formats.fields import check_unique_names, content_lines, m
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.lenses import camera_of_matrix
 from nerfcli.captures.formats.limits import checked_camera, rigid_pose
-from nerfcli.captures.formats.photo_names import GIVE_CAMERA, ListImages, PhotoOfStem
+from nerfcli.captures.formats.photo_names import GIVE_CAMERA, FoundPhotos, find_photos
 from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import UserError
-from nerfcli.photos.images import list_images
 
 POSE_FOLDERS = ("pose", "poses")
 IMAGE_FOLDERS = ("color", "rgb", "images", "image")
@@ -59,7 +59,6 @@ def is_pose(path: Path) -> bool:
 def parse_pose_files(
     folder: Path,
     measure: Measure,
-    list_images: ListImages,
     *,
     camera: Camera | None = None,
     images: Path | None = None,
@@ -78,23 +77,27 @@ def parse_pose_files(
         UserError: a file is damaged (file and line are named), there are no intrinsics, or no photo is on disk.
     """
     files = pose_files(folder)
-    if images is None:
-        places = (folder / name for name in IMAGE_FOLDERS)
-        images = next((place for place in places if place.is_dir() and list_images(place)), files[0].parent)
-    photos, frames = PhotoOfStem(images, list_images, home=folder), []
-    camera_of_size = _cameras(folder, camera)
+    stems = [file.name.removesuffix(".txt").removesuffix(".pose") for file in files]
+    photos = _photos(stems, (folder, files[0].parent), images).required(str(folder), "they give the names")
+    camera_of_size, frames = _cameras(folder, camera), []
     names_give_splits = all(file.name[:2] in _SPLITS for file in files)
-    for file in files:
+    for file, stem, image in zip(files, stems, photos.paths, strict=True):
         world_from_cam = _pose(file)
-        stem = file.name.removesuffix(".txt").removesuffix(".pose")
-        image = photos.find(stem, f"{stem}.color")
         if image is not None and world_from_cam is not None:
             own_camera = camera_of_size(stored_size(image, measure))
             split = _SPLITS[stem[:2]] if names_give_splits else None
             frames.append(Frame(image.name, own_camera, world_from_cam, image=image, split=split))
-    missing = photos.missing(str(folder))
     check_unique_names((frame.name for frame in frames), folder)
-    return Capture(tuple(frames), np.zeros((0, 3)), missing, None, "pose-files")
+    return Capture(tuple(frames), np.zeros((0, 3)), photos.missing, None, "pose-files", notes=photos.notes)
+
+
+def _photos(stems: list[str], homes: tuple[Path, ...], images: Path | None) -> FoundPhotos:
+    """Return the photos of these names; 7-Scenes adds .color to them."""
+    found = find_photos(stems, homes, given=images, folders=IMAGE_FOLDERS)
+    if any(found.paths):
+        return found
+    colour = find_photos([f"{stem}.color" for stem in stems], homes, given=images, folders=IMAGE_FOLDERS)
+    return replace(colour, listed=tuple(stems))
 
 
 def _pose(file: Path) -> np.ndarray | None:
@@ -155,5 +158,5 @@ FORMAT = Format(
     "a matrix per photo, as in ScanNet, 7-Scenes, NSVF",
     "pose/*.txt",
     find_pose_files,
-    lambda path, given: parse_pose_files(path, measure, list_images, camera=given.camera, images=given.images),
+    lambda path, given: parse_pose_files(path, measure, camera=given.camera, images=given.images),
 )

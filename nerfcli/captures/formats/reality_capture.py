@@ -26,8 +26,8 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, numbers, read_text, shown
 from nerfcli.captures.formats.format import Format, by_suffix, only_file
-from nerfcli.captures.formats.photo_names import measured_sizes
-from nerfcli.captures.orientation import Measure
+from nerfcli.captures.formats.photo_names import find_photos
+from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
 
 _EXPECTED = 'expected a file of RealityScan\'s export "Internal/External camera parameters"'
@@ -57,18 +57,18 @@ def parse_reality_capture(path: Path, measure: Measure, *, images: Path | None =
             photos is on disk.
     """
     names, rows, places = _table(path)
-    sizes, missing = measured_sizes(names, images or path.parent, measure, path)
+    found = find_photos(names, (path.parent,), given=images).required(str(path), "the file does not give their sizes")
     value = {key: rows[:, index] for index, key in enumerate(_NUMBERS)}
     angles = np.stack([-value["heading"], value["pitch"], value["roll"]], axis=-1)
     rotations = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
     poses = opencv_from_opengl_pose(rigid.from_parts(rotations, rows[:, :3]))
     frames = []
-    for index, name in enumerate(names):
-        if name in sizes:
+    for index, (name, image) in enumerate(zip(found.names, found.paths, strict=True)):
+        if image is not None:
             intrinsics: dict[str, float] = dict(zip(_NUMBERS[6:], rows[index, 6:].tolist(), strict=True))
-            camera = _camera(intrinsics, sizes[name][0], places[index])
-            frames.append(Frame(name, camera, poses[index], image=sizes[name][1]))
-    return Capture(tuple(frames), np.zeros((0, 3)), missing, None, "reality_capture")
+            camera = _camera(intrinsics, stored_size(image, measure), places[index])
+            frames.append(Frame(name, camera, poses[index], image=image))
+    return Capture(tuple(frames), np.zeros((0, 3)), found.missing, kind="reality_capture", notes=found.notes)
 
 
 def _table(path: Path) -> tuple[list[str], np.ndarray, list[str]]:

@@ -17,8 +17,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed, number, read_json_object, shown, size_of, vector
 from nerfcli.captures.formats.format import Format, has_keys, named
 from nerfcli.captures.formats.limits import checked_camera, quaternion_pose
-from nerfcli.captures.formats.photo_names import ListImages, PhotoOfStem
-from nerfcli.photos.images import list_images
+from nerfcli.captures.formats.photo_names import find_photos
 
 FILES = ("metadata.json", "metadata")
 IMAGE_FOLDERS = ("rgb", "rgbd", "images")
@@ -31,7 +30,7 @@ def is_record3d(content: dict[str, Any]) -> bool:
     return all(key in content for key in (_POSES, "K", "w", "h"))
 
 
-def parse_record3d(path: Path, list_images: ListImages, *, images: Path | None = None) -> Capture:
+def parse_record3d(path: Path, *, images: Path | None = None) -> Capture:
     """Read the frames of a capture; the unit is the metre, by LiDAR or ARKit.
 
     Args:
@@ -47,19 +46,25 @@ def parse_record3d(path: Path, list_images: ListImages, *, images: Path | None =
     poses = content.get(_POSES)
     if not isinstance(poses, list) or not poses:
         raise malformed(where, f"{_POSES} is {shown(poses)}", "expected a list of poses")
-    photos = PhotoOfStem(images, list_images, home=path.parent, names=IMAGE_FOLDERS)
+    stems, sizes = [str(index) for index in range(len(poses))], [size] * len(poses)
+    photos = find_photos(stems, (path.parent,), given=images, folders=IMAGE_FOLDERS, sizes=sizes)
+    photos = photos.required(where, "they give the names")
     intrinsics, frames = _intrinsics(content, len(poses), where).tolist(), []
-    for index, pose in enumerate(poses):
+    for index, (pose, image) in enumerate(zip(poses, photos.paths, strict=True)):
         place = f"{where}: {_POSES}[{index}]"
         row = vector({"pose": pose}, "pose", 7, place)
         world_from_cam = opencv_from_opengl_pose(quaternion_pose(row[:4], row[4:], place))
-        image = photos.find(str(index))
         if image is not None:
             camera = checked_camera("PINHOLE", *size, tuple(intrinsics[index]), where=where)
             frames.append(Frame(image.name, camera, world_from_cam, image=image))
-    missing = photos.missing(where)
     return Capture(
-        tuple(frames), np.zeros((0, 3)), missing, None, "record3d", unit="metre", unit_source="ARKit (Record3D)"
+        tuple(frames),
+        np.zeros((0, 3)),
+        photos.missing,
+        kind="record3d",
+        unit="metre",
+        unit_source="ARKit (Record3D)",
+        notes=photos.notes,
     )
 
 
@@ -84,6 +89,6 @@ FORMAT = Format(
     "Record3D",
     "metadata.json",
     find_record3d,
-    lambda path, given: parse_record3d(path, list_images, images=given.images),
+    lambda path, given: parse_record3d(path, images=given.images),
     axes="opengl",
 )

@@ -18,7 +18,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import parse_colmap, read_model, write_colmap_binary
 from nerfcli.captures.formats.fields import read_json_object
 from nerfcli.captures.formats.format import Format, folder_of
-from nerfcli.captures.formats.photo_names import seen_from
+from nerfcli.captures.formats.photo_names import seen_from, with_photos
 from nerfcli.captures.holdout import default_split
 from nerfcli.captures.stored_pixels import UPRIGHT
 from nerfcli.errors import UserError, in_shell
@@ -229,6 +229,8 @@ def parse_scene(path: Path, *, images: Path | None = None) -> Capture:
     """
     described = read_description(path)
     capture = parse_colmap(described.model_dir, images or described.image_folder)
+    there = described.image_folder if described.image_folder.is_dir() else None
+    capture = with_photos(capture, path, given=images or there)
     frames = described.described(capture.frames)
     return replace(
         capture,

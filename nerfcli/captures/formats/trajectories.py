@@ -19,7 +19,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, shown
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.limits import quaternion_pose, rigid_pose
-from nerfcli.captures.formats.photo_names import GIVE_CAMERA
+from nerfcli.captures.formats.photo_names import GIVE_CAMERA, with_photos
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts
 from nerfcli.errors import UserError
 
@@ -164,7 +164,7 @@ TUM = Format(
     "a trajectory of the TUM RGB-D benchmark",
     ".txt with 8 or 12 numbers a line",
     lambda path: find_lines(path, columns=8),
-    lambda path, given: parse_tum(path, given.camera),
+    lambda path, given: with_photos(parse_tum(path, given.camera), given=given.images),
     open_axes=True,
     default_name="trajectory.txt",
     files=("*.txt",),
@@ -179,7 +179,7 @@ KITTI = Format(
     "a trajectory of the KITTI odometry benchmark",
     ".txt with 8 or 12 numbers a line",
     lambda path: find_lines(path, columns=12),
-    lambda path, given: parse_kitti(path, given.camera),
+    lambda path, given: with_photos(parse_kitti(path, given.camera), given=given.images),
     open_axes=True,
     default_name="poses.txt",
     files=("*.txt",),

@@ -6,7 +6,6 @@ Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips
 
 from collections import Counter
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -22,7 +21,8 @@ from nerfcli.captures.formats.camera_path import find_camera_path
 from nerfcli.captures.formats.fields import malformed, read_json_object
 from nerfcli.captures.formats.format import Format, find_json
 from nerfcli.captures.formats.limits import rigid_poses
-from nerfcli.captures.formats.photo_names import seen_from
+from nerfcli.captures.formats.photo_names import find_photos, seen_from
+from nerfcli.captures.formats.photo_search import plain_name
 from nerfcli.captures.formats.ply import read_points, write_points
 from nerfcli.captures.formats.record3d import find_record3d
 from nerfcli.captures.formats.run_cameras import find_run
@@ -35,15 +35,12 @@ from nerfcli.captures.formats.transforms_cameras import (
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts
 from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, listed, several
 
 SPLITS = ("train", "val", "test")
 
-# Tried in this order where a file_path has no suffix, as in the Blender captures.
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
 
-
-def parse_transforms(path: Path, measure: Measure | None = None) -> Capture:
+def parse_transforms(path: Path, measure: Measure | None = None, *, images: Path | None = None) -> Capture:
     """Read a transforms.json, whether or not its images exist; those without a known size are `missing`.
 
     Poses and points stay in the file's own world. nerfstudio's applied_transform and applied_scale say how that world
@@ -53,17 +50,16 @@ def parse_transforms(path: Path, measure: Measure | None = None) -> Capture:
     Args:
         path: the JSON file; paths in it are relative to its folder.
         measure: returns an image's upright size and EXIF orientation; needed only if the file lacks `w` or `h`.
+        images: the folder of the images, if they are not where the file says.
 
     Raises:
         UserError: the file, or the PLY file of points that it names, is malformed or missing; file and field are named.
     """
     content = read_json_object(path)
-    frames, missing = listed_frames(path, content, measure)
-    splits = _listed_splits(path, content)
-    frames = [replace(frame, split=splits.get(frame.name)) for frame in frames]
+    frames, missing, notes = listed_frames(path, content, measure, images=images)
     check_unique_names(path, frames)
     points, colours = _points_beside(path, content)
-    return Capture(tuple(frames), points, tuple(missing), None, "transforms", colours=colours)
+    return Capture(tuple(frames), points, tuple(missing), None, "transforms", colours=colours, notes=notes)
 
 
 def losses_transforms(capture: Capture) -> tuple[str, ...]:
@@ -88,9 +84,9 @@ def write_transforms(capture: Capture, path: Path) -> None:
     content: dict[str, Any] = dict(next(iter(intrinsics.values()))) if shared else {}
     file_paths = [relative_path(frame, path.parent) for frame in capture.frames]
     for split in SPLITS:
-        listed = [text for text, frame in zip(file_paths, capture.frames, strict=True) if frame.split == split]
-        if listed:
-            content[f"{split}_filenames"] = listed
+        names = [text for text, frame in zip(file_paths, capture.frames, strict=True) if frame.split == split]
+        if names:
+            content[f"{split}_filenames"] = names
     records = []
     for file_path, frame in zip(file_paths, capture.frames, strict=True):
         record = {} if shared else dict(intrinsics[frame.camera])
@@ -133,49 +129,64 @@ def listed_frames(
     suffix: str = "",
     images: Path | None = None,
     size: Size | None = None,
-) -> tuple[list[Frame], list[str]]:
-    """Return the frames of a file as listed, and the names of images whose size is unknown, which have no frame.
+) -> tuple[list[Frame], list[str], tuple[str, ...]]:
+    """Return the frames of a file as listed, the names of images whose size is unknown, which have no frame, and notes.
 
-    Frames with equal intrinsics share one camera.
+    Frames with equal intrinsics share one camera. Masks that are not on disk are left out.
 
     Args:
         measure: returns an image's size, if the file does not give it. An image that is not on disk either gets the
             size of the other images, if they all have the same; if none has one, it is an error.
         suffix: appended to a file_path without a suffix if no such image is on disk, as the format does.
-        images: a folder where images are looked for first: under the paths that the file lists, or their last parts.
+        images: the folder of the images, if they are not where the file says.
         size: of the images, if the file does not give it and none is on disk.
     """
     records = records_of(path, content)
     poses = _poses(path, records)
     merged = [{**content, **record} for record in records]
     wheres = [f"{path}: frames[{index}]" for index in range(len(records))]
-    places, names = [], []
+    sizes = [given_size(record, where) for record, where in zip(merged, wheres, strict=True)]
     is_path = not any("file_path" in record for record in records)  # the views of a camera path have no photo
-    for index, (record, where) in enumerate(zip(records, wheres, strict=True)):
-        listed = _listed_path({"file_path": f"frame_{index:04d}"} if is_path else record, where)
-        plain = listed.replace("\\", "/")
-        found = None
-        if images is not None:
-            found = _find_image(images, plain) or _find_image(images, PurePosixPath(plain).name)
-        found = found or _find_image(path.parent, listed)
-        ending = suffix if found is None and not PurePosixPath(plain).suffix else "" if found is None else found.suffix
-        names.append(_name_of(listed, where, suffix=ending))
-        places.append(found or path.parent / (plain if plain.endswith(ending) else plain + ending))
-    sizes = _sizes(merged, places, wheres, measure=measure, default=size)
+    texts = [
+        _listed_path({"file_path": f"frame_{index:04d}"} if is_path else record, where)
+        for index, (record, where) in enumerate(zip(records, wheres, strict=True))
+    ]
+    found = find_photos(texts, (path.parent,), given=images, sizes=sizes)
+    names = [
+        name if PurePosixPath(name).suffix else name + (suffix if image is None else image.suffix)
+        for name, image in zip(found.names, found.paths, strict=True)
+    ]
+    places = [image or path.parent / name for name, image in zip(names, found.paths, strict=True)]
+    known = _known_sizes(sizes, places, wheres[0], measure=measure, default=size)
+    masks, lost_masks = _masks(path, [record.get("mask_path") for record in merged], wheres, set(places))
+    splits = _listed_splits(path, content)
     cameras: dict[Camera, Camera] = {}
     frames, missing = [], []
-    for record, where, known, name, image, pose in zip(merged, wheres, sizes, names, places, poses, strict=True):
-        if known is None:
-            missing.append(name)
+    for index, (record, where, own_size, pose) in enumerate(zip(merged, wheres, known, poses, strict=True)):
+        if own_size is None:
+            missing.append(names[index])
             continue
-        camera = camera_of_record(record, known, where)
-        mask = record.get("mask_path")
-        if mask is not None and (not isinstance(mask, str) or not mask):
+        camera = camera_of_record(record, own_size, where)
+        split = splits.get(plain_name(texts[index]))
+        frames.append(
+            Frame(names[index], cameras.setdefault(camera, camera), pose, places[index], masks[index], split=split)
+        )
+    return frames, missing, (*found.notes, *lost_masks)
+
+
+def _masks(
+    path: Path, texts: list[Any], wheres: list[str], photos: set[Path]
+) -> tuple[list[Path | None], tuple[str, ...]]:
+    """Return the mask of each frame, None without one or where it is not on disk, and what was left out."""
+    for mask, where in zip(texts, wheres, strict=True):
+        if mask is not None and not isinstance(mask, str):
             raise malformed(where, f"mask_path is {mask!r:.80}", "expected the mask's path as text")
-        if mask is not None:
-            mask = _find_image(path.parent, mask) or path.parent / mask.replace("\\", "/")
-        frames.append(Frame(name, cameras.setdefault(camera, camera), pose, image=image, mask=mask))
-    return frames, missing
+    named = {mask for mask in texts if mask}
+    found = find_photos(sorted(named), (path.parent,), folders=("masks",), others=())
+    paths = {name: image for name, image in zip(found.listed, found.paths, strict=True) if image not in photos}
+    lost = sorted(name for name in named if paths.get(name) is None)
+    notes = (f"{several(len(lost), 'mask')} left out, which {path.name} names and do not exist: {listed(lost)}",)
+    return [paths.get(mask) if mask else None for mask in texts], notes if lost else ()
 
 
 def relative_path(frame: Frame, folder: Path) -> str:
@@ -183,25 +194,20 @@ def relative_path(frame: Frame, folder: Path) -> str:
     return frame.name if frame.image is None else seen_from(folder, frame.image)
 
 
-def _sizes(
-    records: list[dict[str, Any]],
-    images: list[Path],
-    wheres: list[str],
-    *,
-    measure: Measure | None,
-    default: Size | None,
+def _known_sizes(
+    given: list[Size | None], images: list[Path], where: str, *, measure: Measure | None, default: Size | None
 ) -> list[Size | None]:
     """Return the width and height of each frame's picture, given, measured, or the only ones known; None if unknown."""
-    sizes = [given_size(record, where) for record, where in zip(records, wheres, strict=True)]
+    sizes = given
     if measure is not None:
         sizes = [
             stored_size(image, measure) if size is None and image.is_file() else size
             for size, image in zip(sizes, images, strict=True)
         ]
-    given = {size for size in sizes if size is not None} or ({default} if default else set[Size]())
-    if not given:
-        raise malformed(wheres[0], f"w and h are missing, and {images[0]} does not exist", "add the image, or w and h")
-    return [next(iter(given)) if size is None and len(given) == 1 else size for size in sizes]
+    known = {size for size in sizes if size is not None} or ({default} if default else set[Size]())
+    if not known:
+        raise malformed(where, f"w and h are missing, and {images[0]} does not exist", "add the image, or w and h")
+    return [next(iter(known)) if size is None and len(known) == 1 else size for size in sizes]
 
 
 def check_unique_names(path: Path, frames: list[Frame]) -> None:
@@ -212,30 +218,10 @@ def check_unique_names(path: Path, frames: list[Frame]) -> None:
 
 
 def _listed_path(record: dict[str, Any], where: str) -> str:
-    listed = record.get("file_path")
-    if not isinstance(listed, str) or not listed:
-        raise malformed(where, f"file_path is {listed!r:.80}", "expected the image's path as text")
-    return listed
-
-
-def _name_of(listed: str, where: str, *, suffix: str = "") -> str:
-    """Return a name with forward slashes and without "./"; absolute paths are reduced to the file name."""
-    pure = PurePosixPath(listed.replace("\\", "/"))
-    if pure.is_absolute() or ":" in str(pure).split("/")[0]:
-        pure = PurePosixPath(pure.name)
-    name = str(pure)
-    if not pure.name:
-        raise malformed(where, f"file_path is {listed!r:.80}", "expected the path of an image")
-    return name if name.endswith(suffix) else name + suffix
-
-
-def _find_image(folder: Path, listed: str) -> Path | None:
-    for text in dict.fromkeys((listed, listed.replace("\\", "/"))):
-        exact = folder / text
-        for candidate in (exact, *(exact.with_name(exact.name + suffix) for suffix in _SUFFIXES if exact.name)):
-            if candidate.is_file():
-                return candidate
-    return None
+    text = record.get("file_path")
+    if not isinstance(text, str) or not PurePosixPath(plain_name(text)).name:
+        raise malformed(where, f"file_path is {text!r:.80}", "expected the image's path as text")
+    return text
 
 
 def _poses(path: Path, records: list[dict[str, Any]]) -> np.ndarray:
@@ -272,15 +258,15 @@ def _points_beside(path: Path, content: dict[str, Any]) -> tuple[np.ndarray, np.
 
 
 def _listed_splits(path: Path, content: dict[str, Any]) -> dict[str, str]:
-    """Return the split of each name in nerfstudio's train_filenames, val_filenames and test_filenames."""
+    """Return the split of each photo, by its plain name, that nerfstudio's train_filenames and the like list."""
     splits = {}
     for split in SPLITS:
-        listed = content.get(f"{split}_filenames", [])
-        if not isinstance(listed, list) or not all(isinstance(item, str) for item in listed):
+        names = content.get(f"{split}_filenames", [])
+        if not isinstance(names, list) or not all(isinstance(item, str) for item in names):
             raise malformed(
                 str(path), f"{split}_filenames is not a list of paths", "expected a list of file_path texts"
             )
-        splits.update({_name_of(item, f"{path}: {split}_filenames"): split for item in listed})
+        splits.update({plain_name(item): split for item in names})
     return splits
 
 
@@ -297,7 +283,7 @@ FORMAT = Format(
     "nerfstudio, instant-ngp",
     "transforms.json",
     find_transforms,
-    lambda path, given: parse_transforms(path, measure),
+    lambda path, given: parse_transforms(path, measure, images=given.images),
     axes="opengl",
     open_axes=True,
     open_centre=True,
