@@ -32,6 +32,7 @@ from nerfcli.captures.formats.ply import read_points
 from nerfcli.captures.formats.registry import format_named, recognise
 from nerfcli.ct.formats.read import read_scan
 from nerfcli.ct.scan import Scan
+from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.splats.files import read_splats, write_splats
 
@@ -59,7 +60,10 @@ def read_capture(camera: Camera | None, folder: Path) -> None:
     """Read a capture as every command does."""
     places = [folder, *sorted(folder.glob("cameras.json")), *sorted(folder.glob("*.txt"))]
     form, found = recognise(places[0] if camera is None else places[-1])
-    assert_sound(form.parse(found, UserInputs(camera=camera)))
+    capture = form.parse(found, UserInputs(camera=camera))
+    assert_sound(capture)
+    if any("frames left out" in note for note in capture.notes):  # damage to one frame, which is named
+        raise UserError(" ".join([str(folder), *capture.notes]), "")
 
 
 def rich(name: str, place: str, folder: Path) -> None:

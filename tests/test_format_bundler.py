@@ -164,7 +164,7 @@ def edited(number: int, line: str | None) -> str:
         (edited(3, "-60 0 0"), NAMES, "line 3: .*invalid parameters"),
         (edited(3, "60 0"), NAMES, "line 3: has 2 numbers"),
         (edited(4, "1 1 1"), NAMES, "line 4: the upper left 3x3 block is not a rotation"),
-        (edited(7, "1 nan 1"), NAMES, "line 7: 'nan' is not finite"),
+        (edited(18, "1 nan 1"), NAMES, "line 18: 'nan' is not finite"),
         (edited(18, "1 2 x"), NAMES, "line 18: 'x' is not a number"),
         (edited(20, "1 0 5 10"), NAMES, "line 20: announces 1 views, but has 3 numbers"),
         (edited(20, "1 3 5 10 20"), NAMES, "line 20: a view refers to a camera that does not exist"),

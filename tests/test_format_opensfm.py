@@ -173,7 +173,7 @@ SHOT = reconstruction()["shots"]["a.jpg"]
         ({"cameras": {"v2 phone": {**CAMERA, "projection_type": "dual"}}}, "'dual' is not supported"),
         (
             {"cameras": {"v2 phone": {**CAMERA, "projection_type": "spherical"}}},
-            "invalid size of a spherical picture: 640x480",
+            "invalid size of an EQUIRECTANGULAR picture: 640x480",
         ),
         (
             {"cameras": {"v2 phone": {**CAMERA, **RECORDS["fisheye624"], "projection_type": "fisheye624", "k6": 1}}},

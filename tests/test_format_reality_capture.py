@@ -135,7 +135,6 @@ def test_names_photos_and_a_line_before_the_header(tmp_path):
         ((row("a.jpg"), row("b.jpg").replace("28.5", "wide")), OLD, "line 3: 'wide' is not a number"),
         ((row("a.jpg", (1, 2, float("inf"), 0, 0, 0)),), OLD, "line 2: 'inf' is not finite"),
         ((row("a.jpg", lens={**LENS, "f": 0.0}),), OLD, "line 2: .*invalid parameters"),
-        ((row("a.jpg", lens={**LENS, "k4": 0.1}),), OLD, "line 2: k4 is 0.1"),
         ((row("a.jpg"), row("a.jpg")), OLD, "'a.jpg' is listed twice"),
         ((row(""),), OLD, "line 2: the image's name is ''"),
         ((row('"a.jpg'),), OLD, "line 2: is not a valid line of a table"),

@@ -141,12 +141,13 @@ def test_names_and_sizes_without_the_photos(tmp_path):
     assert {frame.camera for frame in capture.frames} == {Camera.pinhole(64, 48, 32 / math.tan(0.5))}
 
 
-def test_a_listed_cloud_must_be_there(tmp_path):
+def test_a_listed_cloud_that_is_missing_is_named(tmp_path):
     frames = [{"file_path": "a.png", "transform_matrix": OPENGL_POSE}]
     shared = {"fl_x": 50, "w": 64, "h": 48, "frames": frames}
     path = write_json(tmp_path / "transforms.json", **shared, ply_file_path="sparse_pc.ply")
-    with pytest.raises(UserError, match=r"transforms\.json: ply_file_path: .*sparse_pc\.ply: No such file"):
-        parse_transforms(path)
+    capture = parse_transforms(path)
+    assert len(capture.points) == 0
+    assert capture.notes == ("sparse_pc.ply, which transforms.json names, does not exist: no points are read",)
     with pytest.raises(UserError, match="ply_file_path is 3"):
         parse_transforms(write_json(path, **shared, ply_file_path=3))
     with pytest.raises(UserError, match="the lens model of ftheta_p0 is not supported"):

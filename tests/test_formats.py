@@ -120,7 +120,7 @@ def test_rounded_poses_become_exactly_rigid(tmp_path):
         ({"frames": [{"file_path": "a.png"}]}, r"frames\[0\]: transform_matrix is missing"),
         ({"frames": [entry("a.png", transform_matrix=[[1, 0], [0, 1]])]}, r"shape \(2, 2\)"),
         ({"frames": [entry("a.png", transform_matrix="no")]}, "not a matrix"),
-        ({"frames": [entry("a.png", transform_matrix=(2 * np.eye(4)).tolist())]}, "is not a rotation"),
+        ({"frames": [entry("a.png", transform_matrix=np.diag([1, 2, 1, 1]).tolist())]}, "is not a rotation"),
         ({"frames": [entry("a.png", transform_matrix=np.diag([1, 1, -1, 1]).tolist())]}, "mirrors the scene"),
         ({"frames": [entry("a.png", transform_matrix=np.full((4, 4), np.nan).tolist())]}, "not finite"),
         ({"frames": [entry("a.png"), {"transform_matrix": OPENGL_POSE}]}, r"frames\[1\]: file_path is None"),
@@ -136,8 +136,6 @@ def test_rounded_poses_become_exactly_rigid(tmp_path):
         ({"fl_x": float("nan")}, "fl_x is nan"),
         ({"w": 48, "h": 64}, "64x48 pixels does not match a camera of 48x64"),
         ({"camera_model": "PENTAGON"}, "camera_model 'PENTAGON' is not supported"),
-        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "fisheye camera with p1 or p2"),
-        ({"k4": 0.1}, "k4 is 0.1 without a fisheye"),
         ({"test_filenames": "a.png"}, "test_filenames is not a list"),
     ],
 )
@@ -275,8 +273,11 @@ def test_colmap_text_by_hand(tmp_path):
     for text, what in (
         ("1 1 0 0 0 1 2 3 4 a.jpg\n\n", "image a.jpg refers to camera 4, which does not exist"),
         ("1 1 0 0 0 1 2 3 3 a.jpg\n\n2 1 0 0 0 1 2 3 3 a.jpg\n\n", "a.jpg is registered twice"),
-        ("1 0 0 0 0 1 2 3 3 a.jpg\n\n", r"images\.txt is damaged: a quaternion"),
-        ("1 1 0 0 0 nan 2 3 3 a.jpg\n\n", "pose of image a.jpg is not 7 finite"),
+        (
+            "1 0 0 0 0 1 2 3 3 a.jpg\n\n",
+            r"txt: the pose of image a\.jpg is not finite, or .* of length 0; only 0 of 1 frame",
+        ),
+        ("1 1 0 0 0 nan 2 3 3 a.jpg\n\n", r"images\.txt: the pose of image a\.jpg is not finite"),
         ("# nothing\n", "no registered images"),
     ):
         (tmp_path / "images.txt").write_text(text)

@@ -5,21 +5,27 @@ says which photo was found.
 """
 
 import json
+import struct
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from captures import ring
 from commands import error_of, nerfcli
+from every_format import WITH_PHOTOS, Views
 from PIL import Image
 from views import PINHOLE, capture_of
 
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opengl_from_opencv_pose
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import write_colmap_text
 from nerfcli.captures.formats.format import UserInputs
+from nerfcli.captures.formats.lens_fits import Fits, Terms
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.errors import BAD_INPUT, UserError
@@ -173,3 +179,273 @@ def test_ten_thousand_names_are_looked_up_in_linear_time(tmp_path, monkeypatch):
     found = find(tmp_path, [name.upper() for name in names])
     assert found.paths == tuple(tmp_path / "images" / name for name in names)
     assert len(listed) == 2  # images/ and the folder itself
+
+
+# Poses
+
+CAMERA = Camera("PINHOLE", 64, 48, (70.0, 70.0, 32.0, 24.0))
+POSES = np.array([frame.world_from_cam for frame in ring(CAMERA, num_frames=8).frames])
+LOST = 2
+# Formats whose files hold matrices, and are written number by number.
+OF_MATRICES = ("metashape", "bundler", "polycam", "mvsnet", "pose-files", "alicevision")
+
+
+def put(form: str, folder: Path, poses: np.ndarray = POSES) -> Path:
+    """Write views in a format of `every_format`; return the file or folder that it is read from."""
+    WITH_PHOTOS[form](Views(CAMERA, poses), folder)
+    return folder
+
+
+def changed(block: np.ndarray, *indices: int) -> np.ndarray:
+    """Return the poses with the rotations of some, or of all, multiplied by a block (3, 3)."""
+    poses = POSES.copy()
+    poses[list(indices) or slice(None), :3, :3] @= block
+    return poses
+
+
+def assert_centres(capture: Capture, expected: np.ndarray) -> None:
+    np.testing.assert_allclose([frame.centre for frame in capture.frames], expected, rtol=0, atol=1e-9)
+    for frame in capture.frames:
+        rotation = frame.world_from_cam[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-12)
+
+
+def edited(path: Path, old: str, new: str) -> None:
+    content = path.read_text(encoding="utf-8")
+    assert old in content
+    path.write_text(content.replace(old, new, 1), encoding="utf-8")
+
+
+def lose_record3d(folder: Path) -> None:
+    content = json.loads((folder / "metadata.json").read_text())
+    content["poses"][LOST][:4] = [0.0] * 4
+    (folder / "metadata.json").write_text(json.dumps(content))
+
+
+def lose_transforms(folder: Path) -> None:
+    content = json.loads((folder / "transforms.json").read_text())
+    content["frames"][LOST]["transform_matrix"] = None
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def lose_opensfm(folder: Path) -> None:
+    content = json.loads((folder / "reconstruction.json").read_text())
+    content[0]["shots"]["2.jpg"]["rotation"] = [float("nan")] * 3
+    (folder / "reconstruction.json").write_text(json.dumps(content))
+
+
+def lose_llff(folder: Path) -> None:
+    rows = np.load(folder / "poses_bounds.npy")
+    rows[LOST, [0, 1, 2, 5, 6, 7, 10, 11, 12]] = 0.0
+    np.save(folder / "poses_bounds.npy", rows)
+
+
+def lose_colmap_text(folder: Path) -> None:
+    lines = (folder / "sparse/0/images.txt").read_text().splitlines()
+    row = next(index for index, line in enumerate(lines) if line.endswith(" 2.jpg"))
+    words = lines[row].split()
+    lines[row] = " ".join([words[0], *["nan"] * 7, *words[8:]])
+    (folder / "sparse/0/images.txt").write_text("\n".join(lines) + "\n")
+
+
+def lose_reality_capture(folder: Path) -> None:
+    path = next(folder.glob("*.csv"))
+    lines = path.read_text().splitlines()
+    row = next(index for index, line in enumerate(lines) if line.startswith("images/2."))
+    words = lines[row].split(",")
+    lines[row] = ",".join([words[0], *["-nan(ind)"] * 3, *words[4:]])
+    path.write_text("\n".join(lines) + "\n")
+
+
+LOSE = {
+    "record3d": lose_record3d,
+    "transforms": lose_transforms,
+    "opensfm": lose_opensfm,
+    "llff": lose_llff,
+    "colmap-text": lose_colmap_text,
+    "reality-capture": lose_reality_capture,
+}
+
+
+@pytest.mark.parametrize("form", [*OF_MATRICES, *LOSE])
+def test_a_frame_without_a_pose_is_left_out_and_named(form, tmp_path):
+    """The other seven have the centres that were written."""
+    if form in LOSE:
+        LOSE[form](put(form, tmp_path))
+    else:
+        put(form, tmp_path, changed(np.full((3, 3), np.nan), LOST))
+    capture = parsed(tmp_path)
+    assert_centres(capture, np.delete(POSES[:, :3, 3], LOST, axis=0))
+    assert len(capture.notes) == 1
+    assert "1 of 8 frames left out: " in capture.notes[0]
+    assert "2" in capture.notes[0].split(" left out: ")[1].split(" (")[0]
+
+
+@pytest.mark.parametrize("form", ["mvsnet", "polycam", "pose-files"])
+@pytest.mark.parametrize("count", [5, 7])
+def test_too_few_poses_are_refused_with_the_reason(form, count, tmp_path):
+    put(form, tmp_path, changed(np.full((3, 3), np.nan), *range(count)))
+    with pytest.raises(UserError, match=f"not finite|nan.*; only {8 - count} of 8 frames can be used"):
+        parsed(tmp_path)
+
+
+@pytest.mark.parametrize("form", OF_MATRICES)
+def test_evenly_scaled_rotations_are_normalised_and_said(form, tmp_path):
+    put(form, tmp_path, changed(0.33 * np.eye(3)))
+    capture = parsed(tmp_path)
+    assert_centres(capture, POSES[:, :3, 3])
+    scale = "3.03" if form == "mvsnet" else "0.33"  # its files hold the inverse
+    assert capture.notes == (f"the rotations of 8 frames are scaled by {scale}: normalised",)
+
+
+@pytest.mark.parametrize("form", OF_MATRICES)
+@pytest.mark.parametrize(
+    ("block", "what"), [((1.0, 1.0, 1.2), "is not a rotation"), ((1.0, 1.0, -1.0), "mirrors the scene")]
+)
+def test_uneven_scale_and_mirrors_stay_refused(form, block, what, tmp_path):
+    put(form, tmp_path, changed(np.diag(block)))
+    with pytest.raises(UserError, match=what):
+        parsed(tmp_path)
+
+
+def test_numbers_as_text_and_names_of_models_in_any_case(tmp_path):
+    photos(tmp_path, numbered("{}.png"))
+    content = transforms_record(numbered("{}.png"), camera_model="opencv", k1=-0.05)
+    content |= {key: str(content[key]) for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert {frame.camera.model for frame in parsed(tmp_path).frames} == {"OPENCV"}
+    assert parsed(tmp_path).frames[0].camera.params[:4] == PINHOLE.params
+    (tmp_path / "transforms.json").write_text(json.dumps({**content, "fl_x": "wide"}))
+    with pytest.raises(UserError, match="fl_x is 'wide'"):
+        parsed(tmp_path)
+
+
+# Models
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_of_several_models_the_largest_is_read_and_the_others_are_counted(end, tmp_path):
+    photos(tmp_path / "images", numbered("{}.png"))
+    named = tuple(replace(frame, name=f"{i}.png") for i, frame in enumerate(CAPTURE.frames))
+    for number, part in (("0", named[:2]), ("1", named[2:]), ("10", named[:1])):
+        own = replace(CAPTURE, frames=part, observations=None)
+        write_colmap_text(own, tmp_path / "sparse" / number)
+        for path in (tmp_path / "sparse" / number).iterdir():
+            path.write_bytes(("\ufeff" + path.read_text().replace("\n", end)).encode())
+    capture = parsed(tmp_path)
+    assert [frame.name for frame in capture.frames] == numbered("{}.png")[2:]
+    assert capture.notes == (
+        "sparse/1 with 4 photos is read; other models, which are in other coordinates: sparse/0 with 2, sparse/10 "
+        "with 1",
+    )
+
+
+def test_a_lens_of_a_later_colmap_is_named_with_what_supports_it(tmp_path):
+    put("colmap", tmp_path)
+    path = tmp_path / "sparse/0/cameras.bin"
+    path.write_bytes(path.read_bytes()[:12] + struct.pack("<i", 31) + path.read_bytes()[16:])
+    with pytest.raises(
+        UserError, match=r"cameras\.bin: camera 1 has the camera model 31, which COLMAP .* lacks"
+    ) as caught:
+        parsed(tmp_path)
+    assert "EQUIRECTANGULAR" in caught.value.hint
+
+
+@pytest.mark.parametrize("form", ["transforms", "colmap"])
+def test_a_sphere_that_is_not_two_to_one_is_refused(form, tmp_path):
+    photos(tmp_path / "images", numbered("{}.png"))
+    if form == "transforms":
+        content = transforms_record(numbered("images/{}.png"), camera_model="equirectangular")
+        (tmp_path / "transforms.json").write_text(json.dumps(content))
+    else:
+        colmap(tmp_path, numbered("{}.png"))
+        (tmp_path / "sparse/0/cameras.txt").write_text("1 EQUIRECTANGULAR 640 480 640 480\n")
+    with pytest.raises(UserError, match="EQUIRECTANGULAR picture: 640x480") as caught:
+        parsed(tmp_path)
+    assert "twice as wide as high" in caught.value.hint
+
+
+# Lenses
+
+SAMPLE_PX = np.stack(np.meshgrid(np.linspace(2, 158, 27), np.linspace(2, 118, 21)), axis=-1).reshape(-1, 2)
+
+
+def brown(x: np.ndarray, y: np.ndarray, focal: float, k: Sequence[float], skew: float) -> np.ndarray:
+    """Return pixels of Brown's polynomial of any number of terms with skew, by the formula."""
+    square = x * x + y * y
+    factor = 1 + sum(term * square ** (power + 1) for power, term in enumerate(k))
+    return np.stack([focal * x * factor + skew * y * factor + 80, focal * y * factor + 60], axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("k", "skew", "said"),
+    [
+        ((-0.06, 0.03, -0.02, 0.05), 0.0, "k4 of 1 camera, which FULL_OPENCV does not have: at most 0.0088 px off"),
+        ((-0.05, 0.0, 0.0, 0.0), 0.07, "skew of 1 camera, which SIMPLE_RADIAL does not have: at most 0.03 px off"),
+    ],
+)
+def test_terms_that_no_lens_has_are_fitted_and_the_error_is_said(k, skew, said):
+    fits = Fits()
+    camera = fits.brown((160, 120), (140.0, 140.0), (80.0, 60.0), terms=Terms(k, skew=skew), where="here")
+    x, y = (SAMPLE_PX - (80, 60)).T / 140
+    pixels, _ = camera.project(np.stack([x, y, np.ones_like(x)], axis=-1))
+    assert np.linalg.norm(pixels - brown(x, y, 140.0, k, skew), axis=1).max() < 0.1
+    assert fits.notes() == (said,)
+
+
+@pytest.mark.parametrize(
+    ("size", "focal", "terms", "what"),
+    [
+        ((160, 120), 140.0, Terms(skew=0.6, skew_name="b2"), r"b2 is 0.6, .* off by 0.26 px"),
+        ((4000, 3000), 2000.0, Terms((-0.06, 0.03, -0.02, 0.05)), r"k4 is 0.05, .* off by 0.25 px"),
+    ],
+)
+def test_terms_that_matter_are_refused_by_name(size, focal, terms, what):
+    """Skew moves the edge of the picture by skew height / (2 focal): 0.26 px."""
+    with pytest.raises(UserError, match=what):
+        Fits().brown(size, (focal, focal), (size[0] / 2, size[1] / 2), terms=terms, where="here")
+
+
+def test_a_fisheye_with_tangential_terms_is_a_thin_prism_fisheye(tmp_path):
+    photos(tmp_path, numbered("{}.png"))
+    more = {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "p1": 0.001, "p2": -0.002}
+    (tmp_path / "transforms.json").write_text(json.dumps(transforms_record(numbered("{}.png"), **more)))
+    camera = parsed(tmp_path).frames[0].camera
+    assert camera == Camera("THIN_PRISM_FISHEYE", *SIZE, (*PINHOLE.params, 0.02, 0, 0.001, -0.002, 0, 0, 0, 0))
+
+
+# Masks, groups
+
+
+def test_masks_that_are_missing_are_left_out_and_named(tmp_path):
+    photos(tmp_path, numbered("{}.png"))
+    photos(tmp_path, ["masks/0.png"])
+    content = transforms_record(numbered("{}.png"))
+    for frame, mask in zip(content["frames"], ("C:\\x\\masks\\0.png", "masks/1.png", "", None), strict=False):
+        frame["mask_path"] = mask
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    capture = parsed(tmp_path)
+    assert [frame.mask for frame in capture.frames] == [tmp_path / "masks/0.png", *[None] * (COUNT - 1)]
+    assert capture.notes == ("1 mask left out, which transforms.json names and do not exist: masks/1.png",)
+
+
+def test_equal_labels_of_metashape_are_told_apart_by_their_groups(tmp_path):
+    put("metashape", tmp_path)
+    path = tmp_path / "cameras.xml"
+    photos(tmp_path / "images", ["left/0.jpg", "right/0.jpg"], size=CAMERA.size)
+    edited(path, 'label="1"', 'label="0"')
+    with pytest.raises(UserError, match="'0' is listed twice"):
+        parsed(path)
+    tree = ElementTree.parse(path)
+    cameras = tree.find("chunk/cameras")
+    assert cameras is not None
+    for side, camera in zip(("left", "right"), list(cameras)[:2], strict=True):
+        cameras.remove(camera)
+        ElementTree.SubElement(cameras, "group", label=side).append(camera)
+    next(iter(cameras)).attrib.pop("label")
+    tree.write(path)
+    capture = parsed(path)
+    images = {frame.name: frame.image for frame in capture.frames}
+    assert images["left/0"] == tmp_path / "images/left/0.jpg"
+    assert images["right/0"] == tmp_path / "images/right/0.jpg"
+    assert "1 of 8 cameras left out, without a label: id 2" in capture.notes

@@ -69,9 +69,10 @@ def doctor(
             )
         page = writing.beside(given, "-doctor.html")
         with console.stage(f"doctor {path.name}") as reporter:
-            diagnosis = examine_capture(
-                find_subject(path, subfolders=subfolders), page, intrinsics, resources=resources, reporter=reporter
-            )
+            subject = find_subject(path, subfolders=subfolders)
+            for text in subject.scene.notes if subject.scene is not None else ():
+                reporter.warn(text)
+            diagnosis = examine_capture(subject, page, intrinsics, resources=resources, reporter=reporter)
         show_findings(diagnosis, page.at(path), content(diagnosis), console)
         check_gate(diagnosis.findings, require)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerfcli.cameras.rigid import Similarity, apply, inverse
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.colmap import find_model, parse_colmap
+from nerfcli.captures.formats.colmap import find_model, parse_colmap, parse_model
 from nerfcli.errors import reason_of
 from nerfcli.matching.camera_check import CameraCheck, check_cameras
 from nerfcli.matching.correspondences import SharedFeatures
@@ -197,7 +197,9 @@ def tracks_of_model(scene: Capture, photos: Sequence[LoadedPhoto]) -> Tracks:
     Neither the observations in held-out photos are read nor the 3D positions of points, which depend on them.
     """
     folder = find_model(scene.root)
-    capture = parse_colmap(folder) if folder is not None else None
+    # A COLMAP model may name photos by paths of another machine: `parse_model` names them as the scene does.
+    parse = parse_model if scene.kind.startswith("colmap") else parse_colmap
+    capture = parse(folder) if folder is not None else None
     parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))]
     if capture is not None and capture.observations is not None:
         seen = capture.observations

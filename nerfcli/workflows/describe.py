@@ -101,6 +101,7 @@ def _describe_capture(path: Path) -> dict[str, Any]:
             "points": len(capture.points),
             "unit": capture.unit,
             "unit_source": capture.unit_source,
+            "notes": list(capture.notes) or None,
         }
     scene = with_photos_on_disk(path, form, found, capture)
     return {
@@ -112,6 +113,7 @@ def _describe_capture(path: Path) -> dict[str, Any]:
         "unused_masks": describe_unused_masks(scene),
         **_camera_facts(scene.frames),
         "rescaled": describe_rescaling(scene.rescaled),
+        "notes": list(scene.notes) or None,
         "points": len(scene.points),
         "unit": scene.unit,
         "unit_source": scene.unit_source,

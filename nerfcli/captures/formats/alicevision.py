@@ -12,6 +12,7 @@ Source: alicevision/AliceVision src/aliceVision: sfmDataIO/jsonIO.cpp, camera/ca
 import posixpath
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from nerfcli.captures.formats.fields import (
     size_of,
 )
 from nerfcli.captures.formats.format import Format, by_suffix, has_keys
-from nerfcli.captures.formats.limits import rigid_pose
+from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
 
 FILES = ("cameras.sfm", "sfm.sfm", "sfm.json")
@@ -68,8 +69,10 @@ def parse_alicevision(path: Path, *, images: Path | None = None) -> Capture:
         key: _camera(record, place, version)
         for key, record, place in _identified(content["intrinsics"], "intrinsicId", f"{path}: intrinsics")
     }
+    usable = FramePoses()
     poses = {
-        key: _pose(record, place) for key, record, place in _identified(content["poses"], "poseId", f"{path}: poses")
+        key: usable.read(key, place, partial(_matrix, record, place))
+        for key, record, place in _identified(content["poses"], "poseId", f"{path}: poses")
     }
     views = [(record_of(view, f"{path}: views[{i}]"), f"{path}: views[{i}]") for i, view in enumerate(content["views"])]
     paths = [name_of(view.get("path"), where) for view, where in views]
@@ -79,11 +82,12 @@ def parse_alicevision(path: Path, *, images: Path | None = None) -> Capture:
         if "rigId" in view:
             raise malformed(where, "belongs to a camera rig", "rigs are not supported; convert to COLMAP in Meshroom")
         pose, camera = view.get("poseId"), view.get("intrinsicId")
-        if not isinstance(pose, str) or pose not in poses:
+        world_from_cam = poses.get(pose) if isinstance(pose, str) else None
+        if world_from_cam is None:
             continue
         if not isinstance(camera, str) or camera not in cameras:
             raise malformed(where, f"intrinsicId is {shown(camera)}", "expected the id of one of the intrinsics")
-        frames.append(Frame(place, cameras[camera], poses[pose]))
+        frames.append(Frame(place, cameras[camera], world_from_cam))
     check_unique_names((frame.name for frame in frames), path)
     sizes = [frame.camera.size for frame in frames]
     found = find_photos([frame.name for frame in frames], (path.parent,), given=images, sizes=sizes)
@@ -91,7 +95,9 @@ def parse_alicevision(path: Path, *, images: Path | None = None) -> Capture:
         name = frame.name.removeprefix(folder)
         frames[index] = replace(frame, name=name, image=image or (images or path.parent) / name)
     points, colours = _points(content.get("structure", []), f"{path}: structure")
-    return Capture(tuple(frames), points, (), None, "alicevision", colours=colours, notes=found.notes)
+    return Capture(
+        tuple(frames), points, (), None, "alicevision", colours=colours, notes=(*found.notes, *usable.notes())
+    )
 
 
 def _identified(records: list[Any], key: str, where: str) -> Iterator[tuple[str, dict[str, Any], str]]:
@@ -124,11 +130,12 @@ def _number(record: dict[str, Any], key: str, where: str, *, default: str | None
     return _numbers([record.get(key, default)], 1, f"{where}: {key}")[0]
 
 
-def _pose(record: dict[str, Any], where: str) -> np.ndarray:
+def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
+    """Return the first three rows of world_from_cam, (3, 4)."""
     transform = record_of(record_of(record.get("pose"), f"{where}: pose").get("transform"), f"{where}: transform")
     rotation = np.array(_numbers(transform.get("rotation"), 9, f"{where}: rotation")).reshape(3, 3)
     centre = np.array(_numbers(transform.get("center"), 3, f"{where}: center"))
-    return rigid_pose(np.column_stack([rotation, centre]), where)
+    return np.column_stack([rotation, centre])
 
 
 def _camera(record: dict[str, Any], where: str, version: tuple[int, ...]) -> Camera:

@@ -9,18 +9,19 @@ Source: Noah Snavely, "Bundler v0.4 User's Manual", section "Output format and s
 """
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, name_of, numbers, read_text
 from nerfcli.captures.formats.format import Format, by_suffix, only_file
-from nerfcli.captures.formats.limits import rigid_pose
+from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
@@ -66,13 +67,16 @@ def parse_bundler(
     check_unique_names((names[index] for index in registered), image_list if registered else path)
     found = find_photos([names[index] for index in registered], (image_list.parent,), given=images)
     found = found.required(str(path), "the file does not give their sizes")
-    frames, middles = [], []
+    poses, frames, middles = FramePoses(), [], []
     index_of_camera = np.full(num_cameras, -1, dtype=np.int64)
     for index, name, image in zip(registered, found.names, found.paths, strict=True):
-        if image is not None:
+        own = lines[1 + 5 * index : 6 + 5 * index]
+        pose = poses.read_inverse(name, f"{path}: line {own[1][0]}", partial(_matrix, own, path))
+        if image is not None and pose is not None:
             size = stored_size(image, measure)
             index_of_camera[index] = len(frames)
-            frames.append(_frame(name, lines[1 + 5 * index : 6 + 5 * index], size, image, path))
+            camera = _camera(own, size, path)
+            frames.append(Frame(name, camera, opencv_from_opengl_pose(pose), image=image))
             middles.append((size[0] / 2, size[1] / 2))
     points, colours, views = _points(lines[1 + 5 * num_cameras :], num_cameras, num_points, path)
     seen = _observations(views, index_of_camera, np.array(middles))
@@ -83,7 +87,7 @@ def parse_bundler(
         kind="bundler",
         colours=colours if num_points else None,
         observations=seen,
-        notes=found.notes,
+        notes=(*found.notes, *poses.notes()),
     )
 
 
@@ -139,14 +143,16 @@ def _listed(line: str, where: str) -> str:
     return name_of(line, where).removeprefix("./")
 
 
-def _frame(name: str, lines: list[Numbered], size: tuple[int, int], image: Path, path: Path) -> Frame:
+def _camera(lines: list[Numbered], size: tuple[int, int], path: Path) -> Camera:
     focal, k1, k2 = numbers(*_line(lines, 0, 3, path))
-    where = f"{path}: line {lines[0][0]}"
-    middle = (size[0] / 2, size[1] / 2)
-    camera = lenses.brown_camera(size, (focal, focal), middle, radial=(k1, k2, 0.0), where=where)
+    where, middle = f"{path}: line {lines[0][0]}", (size[0] / 2, size[1] / 2)
+    return lenses.brown_camera(size, (focal, focal), middle, radial=(k1, k2, 0.0), where=where)
+
+
+def _matrix(lines: list[Numbered], path: Path) -> np.ndarray:
+    """Return the first three rows of cam_from_world, (3, 4)."""
     rows = np.array([numbers(*_line(lines, row, 3, path)) for row in range(1, 5)])
-    cam_from_world = rigid_pose(np.column_stack([rows[:3], rows[3]]), f"{path}: line {lines[1][0]}")
-    return Frame(name, camera, opencv_from_opengl_pose(rigid.inverse(cam_from_world)), image=image)
+    return np.column_stack([rows[:3], rows[3]])
 
 
 def _points(

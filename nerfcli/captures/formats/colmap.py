@@ -10,6 +10,7 @@ Source: colmap.github.io/format.html; colmap src/colmap/scene/reconstruction_io_
 import struct
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,7 +22,7 @@ from nerfcli.captures.formats.colmap_model import ColmapImage, ColmapModel, capt
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.photo_names import with_photos
 from nerfcli.captures.formats.unsupported import lost_parts
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, several
 
 FILES = ("cameras", "images", "points3D")
 # Models are replaced as a whole: new files would be wrong together with remaining files of another model.
@@ -61,8 +62,20 @@ def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
 
 
 def parse_model(model_dir: Path, *, images: Path | None = None) -> Capture:
-    """Read a COLMAP model, with its photos in the given folder, or in the model's folder or up to three above it."""
-    return with_photos(parse_colmap(model_dir), model_dir, *model_dir.resolve().parents[:3], given=images)
+    """Read a COLMAP model, with its photos in the given folder, or in the model's folder or up to three above it.
+
+    Other models of the same reconstruction are named in a note.
+    """
+    capture = with_photos(parse_colmap(model_dir), model_dir, *model_dir.resolve().parents[:3], given=images)
+    others = [model for model in _models_in(_home_of(model_dir)) if not model.samefile(model_dir)]
+    if not others:
+        return capture
+    counts = ", ".join(f"{_seen(model)} with {num_images(model)}" for model in others)
+    note = (
+        f"{_seen(model_dir)} with {several(len(capture.frames), 'photo')} is read; other models, which are in other "
+        f"coordinates: {counts}"
+    )
+    return replace(capture, notes=(note, *capture.notes))
 
 
 def read_model(model_dir: Path) -> ColmapModel:
@@ -74,7 +87,7 @@ def read_model(model_dir: Path) -> ColmapModel:
     cameras_file, images_file, points_file = (_file(model_dir, name) for name in FILES)
     encoding = _ENCODINGS[cameras_file.suffix]
     cameras = _parse(cameras_file, encoding.cameras_from_bytes)
-    images = _parse(images_file, encoding.images_from_bytes)
+    images, notes = _parse(images_file, encoding.images_from_bytes)
     point_ids, points, colours = _parse(points_file, encoding.points_from_bytes)
     if not images:
         raise UserError(f"{model_dir} has no registered images", "the reconstruction is empty; run it again")
@@ -86,7 +99,7 @@ def read_model(model_dir: Path) -> ColmapModel:
             f"{model_dir}: image {twice} is registered twice",
             "each image must have one pose; reconstruct the model again",
         )
-    return ColmapModel(cameras, tuple(sorted(images, key=lambda image: image.name)), points, point_ids, colours)
+    return ColmapModel(cameras, tuple(sorted(images, key=lambda image: image.name)), points, point_ids, colours, notes)
 
 
 def read_cameras(path: Path) -> tuple[dict[int, Camera], dict[str, int]]:
@@ -102,7 +115,7 @@ def read_cameras(path: Path) -> tuple[dict[int, Camera], dict[str, int]]:
     images_file = path.with_name(f"images{path.suffix}")
     if not images_file.is_file():
         return cameras, {}
-    images = _parse(images_file, encoding.images_from_bytes)
+    images, _ = _parse(images_file, encoding.images_from_bytes)
     for image in images:
         _check_camera(image, cameras, images_file)
     return cameras, {image.name: image.camera_id for image in images}
@@ -192,14 +205,42 @@ def _write(capture: Capture, path: Path, suffix: str, *, wrong: list[str]) -> No
         (partial / f"points3D{suffix}").write_bytes(encoding.points_to_bytes(model))
 
 
-_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+_FOLDERS = ("sparse", "colmap/sparse", ".", "distorted/sparse")
 
 
 def find_model(path: Path) -> Path | None:
-    """Find the folder of a COLMAP model, or the one that a file of it is in."""
+    """Find the folder of a COLMAP model, or the one that a file of it is in; of several models, that of most images."""
     if path.is_file():
         return path.parent if path.name in MODEL_FILES and is_model(path.parent) else None
-    return next((path / name for name in _FOLDERS if is_model(path / name)), None)
+    found = next(filter(None, (_models_in(path / name) for name in _FOLDERS)), [])
+    return max(found, key=num_images, default=None)
+
+
+def num_images(model_dir: Path) -> int:
+    """Return the number of images that a model announces; 0 if its file is damaged."""
+    path = _file(model_dir, "images")
+    if path.suffix == ".txt":
+        with path.open(encoding="utf-8-sig", errors="replace") as stream:
+            # The line after an image's line lists its features.
+            return sum(1 for line in stream if line.strip() and line[0] != "#" and (next(stream, "") or True))
+    with path.open("rb") as stream:
+        head = stream.read(8)
+    return int.from_bytes(head, "little") if len(head) == 8 else 0
+
+
+def _models_in(folder: Path) -> list[Path]:
+    """Return the models in the numbered folders of a folder, then the one in the folder itself."""
+    numbered = [path for path in folder.iterdir() if path.name.isdecimal()] if folder.is_dir() else []
+    return [path for path in (*sorted(numbered, key=lambda path: int(path.name)), folder) if is_model(path)]
+
+
+def _home_of(model_dir: Path) -> Path:
+    """Return the folder in which the other models of a reconstruction are."""
+    return model_dir.parent if model_dir.name.isdecimal() else model_dir
+
+
+def _seen(model_dir: Path) -> str:
+    return "/".join(model_dir.resolve().parts[-2:])
 
 
 BINARY = Format(

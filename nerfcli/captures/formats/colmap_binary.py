@@ -13,12 +13,15 @@ import pycolmap
 from nerfcli.cameras.camera import Camera, parameter_names
 from nerfcli.captures.formats.colmap_model import ColmapImage, ColmapModel, ImageRow, images_of_rows, pose_rows, tracks
 from nerfcli.captures.formats.limits import checked_camera, plausible
+from nerfcli.errors import UserError
 
 _FEATURE = np.dtype([("pixel", "<f8", 2), ("point_id", "<i8")])
 _POINT = np.dtype(
     [("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track_length", "<u8")]
 )  # packed: 51 bytes
 _TRACK_BYTES = 8  # image id and index of the feature
+
+_MODELS = {value.value: name for name, value in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
 
 # COLMAP's value for the reprojection error of a point if it was not measured.
 _NO_ERROR = -1.0
@@ -29,7 +32,13 @@ def cameras_from_bytes(data: bytes) -> dict[int, Camera]:
     cameras, offset = {}, 8
     for _ in range(_count(data, 24)):
         camera_id, model_id, width, height = struct.unpack_from("<IiQQ", data, offset)
-        model = pycolmap.CameraModelId(model_id).name
+        if model_id not in _MODELS:
+            raise UserError(
+                f"camera {camera_id} has the camera model {model_id}, which COLMAP {pycolmap.__version__} lacks",
+                f"a later or changed COLMAP wrote it; supported are {', '.join(sorted(_MODELS.values()))}: convert it "
+                "there (colmap image_undistorter writes PINHOLE), or estimate the poses with nerfcli poses",
+            )
+        model = _MODELS[model_id]
         num_params = len(parameter_names(model))
         params = struct.unpack_from(f"<{num_params}d", data, offset + 24)
         if camera_id in cameras:
@@ -40,8 +49,8 @@ def cameras_from_bytes(data: bytes) -> dict[int, Camera]:
     return cameras
 
 
-def images_from_bytes(data: bytes) -> list[ColmapImage]:
-    """Return the images, in the file's order. Raises ValueError or struct.error where the bytes are damaged."""
+def images_from_bytes(data: bytes) -> tuple[list[ColmapImage], tuple[str, ...]]:
+    """Return the images, in the file's order, and notes. Raises ValueError or struct.error where bytes are damaged."""
     rows, offset = list[ImageRow](), 8
     for _ in range(_count(data, 73)):
         image_id, *pose, camera_id = struct.unpack_from("<I7dI", data, offset)

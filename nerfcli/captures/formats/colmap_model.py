@@ -10,10 +10,13 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture, Observations
-from nerfcli.captures.formats.limits import plausible
+from nerfcli.captures.formats.limits import left_out, plausible
+from nerfcli.errors import UserError
 
 # Point id of a feature without a point: in the file, the largest unsigned 64-bit number, which is -1 if signed.
 NO_POINT = -1
+
+_REGISTER = "register the image again, or remove its lines"
 
 
 @dataclass(frozen=True)
@@ -37,13 +40,17 @@ class ColmapImage:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """Cameras by id, images in any order, and points (N, 3) float64 with ids (N,) int64 and colours (N, 3) uint8."""
+    """Cameras by id, images in any order, and points (N, 3) float64 with ids (N,) int64 and colours (N, 3) uint8.
+
+    `notes` says which images were left out, for people.
+    """
 
     cameras: dict[int, Camera]
     images: tuple[ColmapImage, ...]
     points: np.ndarray
     point_ids: np.ndarray
     colours: np.ndarray
+    notes: tuple[str, ...] = ()
 
 
 # An image as a file holds it: its id, name, camera's id, `cam_from_world` as a quaternion wxyz and a translation (7,),
@@ -51,24 +58,30 @@ class ColmapModel:
 ImageRow = tuple[int, str, int, Sequence[float], np.ndarray, np.ndarray]
 
 
-def images_of_rows(rows: list[ImageRow]) -> list[ColmapImage]:
-    """Return the images of a file.
+def images_of_rows(rows: list[ImageRow]) -> tuple[list[ColmapImage], tuple[str, ...]]:
+    """Return the images of a file, without those whose pose is not finite or has no rotation, and a note about these.
 
     Raises:
         ValueError: a number is invalid, in which case its image is named, or two images have the same id.
+        UserError: too few images have a usable pose.
     """
     if len({row[0] for row in rows}) < len(rows):
         raise ValueError("two images have the same id")
     cam_from_world = np.array([row[3] for row in rows], dtype=np.float64).reshape(-1, 7)
-    wrong = ~plausible(cam_from_world)
+    usable = np.asarray(np.isfinite(cam_from_world).all(axis=1) & cam_from_world[:, :4].any(axis=1))
+    wrong = usable & ~plausible(cam_from_world)
     if wrong.any():
         values = ", ".join(f"{value:g}" for value in cam_from_world[np.argmax(wrong)])
-        raise ValueError(
-            f"the pose of image {rows[np.argmax(wrong)][1]} is not 7 finite numbers in a plausible range: {values}"
-        )
-    zero = ~cam_from_world[:, :4].any(axis=1)
-    if zero.any():
-        raise ValueError(f"a quaternion of length 0 in the pose of image {rows[np.argmax(zero)][1]}")
+        raise ValueError(f"the pose of image {rows[np.argmax(wrong)][1]} is not in a plausible range: {values}")
+    lost = [
+        (rows[i][1], UserError(f"the pose of image {rows[i][1]} is not finite, or a quaternion of length 0", _REGISTER))
+        for i in np.flatnonzero(~usable)
+    ]
+    notes = left_out(lost, len(rows))
+    rows, cam_from_world = (
+        [row for row, kept in zip(rows, usable.tolist(), strict=True) if kept],
+        cam_from_world[usable],
+    )
     rotations = rigid.rotation_from_quaternion(cam_from_world[:, :4])
     poses = rigid.inverse(rigid.from_parts(rotations, cam_from_world[:, 4:]))
     images = []
@@ -76,7 +89,7 @@ def images_of_rows(rows: list[ImageRow]) -> list[ColmapImage]:
         if not name or not plausible(pixels.reshape(1, -1)).all():
             raise ValueError(f"image {image_id} ({name!r}) has no name, or a feature with invalid coordinates")
         images.append(ColmapImage(image_id, name, camera_id, pose, pixels, point_ids))
-    return images
+    return images, notes
 
 
 def capture_of(model: ColmapModel, image_dir: Path | None) -> Capture:
@@ -109,7 +122,9 @@ def capture_of(model: ColmapModel, image_dir: Path | None) -> Capture:
             pixels=np.concatenate([image.pixels for image in images]),
         )
     colours = model.colours if model.colours.any() else None
-    return Capture(frames, model.points, (), None, "colmap", colours=colours, observations=observations)
+    return Capture(
+        frames, model.points, (), None, "colmap", colours=colours, observations=observations, notes=model.notes
+    )
 
 
 def model_of(capture: Capture) -> ColmapModel:

@@ -24,12 +24,12 @@ def cameras_from_bytes(data: bytes) -> dict[int, Camera]:
         if int(camera_id) in cameras:
             raise ValueError(f"two cameras have the id {camera_id}")
         values = tuple(float(value) for value in params)
-        cameras[int(camera_id)] = checked_camera(model, int(width), int(height), values, where=where)
+        cameras[int(camera_id)] = checked_camera(model.upper(), int(width), int(height), values, where=where)
     return cameras
 
 
-def images_from_bytes(data: bytes) -> list[ColmapImage]:
-    """Return the images, in the file's order. Raises ValueError where a line is damaged."""
+def images_from_bytes(data: bytes) -> tuple[list[ColmapImage], tuple[str, ...]]:
+    """Return the images, in the file's order, and notes. Raises ValueError where a line is damaged."""
     rows, lines = list[ImageRow](), iter(_lines(data))
     for line in lines:
         if not line.strip() or line.startswith("#"):
@@ -109,7 +109,7 @@ def points_to_bytes(model: ColmapModel) -> bytes:
 
 def _lines(data: bytes) -> list[str]:
     # Not splitlines(), which also splits at characters that a file name may hold.
-    return [line.removesuffix("\r") for line in data.decode("utf-8").split("\n")]
+    return [line.removesuffix("\r") for line in data.decode("utf-8-sig").split("\n")]
 
 
 def _filled(lines: list[str]) -> list[str]:

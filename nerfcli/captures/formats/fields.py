@@ -5,16 +5,19 @@
 
 import json
 import math
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
-from nerfcli.captures.formats.limits import MOST_PIXELS, MOST_UNITS
+from nerfcli.captures.formats.limits import MOST_PIXELS, MOST_UNITS, NotFiniteError
 from nerfcli.errors import UserError
 
 _LONGEST_NAME = 1000
+# As Python, C and Microsoft's C print it.
+_NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|1\.#)", re.IGNORECASE)
 
 
 def malformed(where: str, what: str, hint: str) -> UserError:
@@ -109,12 +112,12 @@ def number(record: dict[str, Any], key: str, where: str, *, default: float | Non
     Raises:
         UserError: the key is absent and there is no default, or its value is not a finite number.
     """
-    value = record.get(key, default)
-    if not _is_number(value):
-        raise malformed(
-            where, f"{key} is {shown(value)}" if key in record else f"{key} is missing", "expected a number"
-        )
-    return float(value)
+    value = _number_of(record.get(key, default))
+    if value is None:
+        kind = NotFiniteError if _is_not_finite(record.get(key, "")) else UserError
+        what = f"{key} is {shown(record.get(key))}" if key in record else f"{key} is missing"
+        raise kind(f"{where}: {what}", "expected a number")
+    return value
 
 
 def vector(record: dict[str, Any], key: str, count: int, where: str) -> np.ndarray:
@@ -124,10 +127,13 @@ def vector(record: dict[str, Any], key: str, count: int, where: str) -> np.ndarr
         UserError: the key is absent, or its value is not such a list.
     """
     value = record.get(key)
-    if not isinstance(value, list) or len(value) != count or not all(map(_is_number, value)):
+    values = [_number_of(item) for item in value] if isinstance(value, list) else []
+    if len(values) != count or None in values:
         what = f"{key} is missing" if key not in record else f"{key} is {shown(value)}"
-        raise malformed(where, what, f"expected a list of {count} numbers")
-    return np.array(value, dtype=np.float64)
+        lost = value is None or (isinstance(value, list) and any(map(_is_not_finite, value)))
+        kind = NotFiniteError if lost and key in record else UserError
+        raise kind(f"{where}: {what}", f"expected a list of {count} numbers")
+    return np.array(values, dtype=np.float64)
 
 
 def size_of(width: float, height: float, where: str) -> tuple[int, int]:
@@ -168,8 +174,23 @@ def check_unique_names(names: Iterable[str], path: Path) -> None:
         raise malformed(str(path), "lists no images with a pose", "the reconstruction is empty; run it again")
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and -MOST_UNITS <= value <= MOST_UNITS
+def _number_of(value: Any) -> float | None:
+    """Return the value of a number, or of a text that is one; None if it is neither, or out of range."""
+    if isinstance(value, str):
+        try:
+            value = float(value)
+        except ValueError:
+            return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not -MOST_UNITS <= value <= MOST_UNITS:
+        return None
+    return float(value)
+
+
+def _is_not_finite(value: Any) -> bool:
+    """Return whether a value is what programs write where a number is not known: null, NaN or infinity."""
+    if isinstance(value, str):
+        return _NOT_FINITE.match(value) is not None
+    return value is None or (isinstance(value, float) and not math.isfinite(value))
 
 
 def _is_plain(text: str) -> bool:
@@ -178,12 +199,15 @@ def _is_plain(text: str) -> bool:
 
 
 def _refuse_number(words: Iterable[str], where: str) -> NoReturn:
+    hint = "the file was changed or truncated; write it again"
     for word in words:
+        if _is_not_finite(word):
+            raise NotFiniteError(f"{where}: {shown(word)} is not finite", hint)
         try:
             if -MOST_UNITS <= float(word) <= MOST_UNITS:
                 continue
-            what = f"{shown(word)} is not finite" if not math.isfinite(float(word)) else f"{shown(word)} is too large"
+            what = f"{shown(word)} is too large"
         except ValueError:
             what = f"{shown(word)} is not a number"
-        raise malformed(where, what, "the file was changed or truncated; write it again")
+        raise malformed(where, what, hint)
     raise AssertionError("called for valid numbers")

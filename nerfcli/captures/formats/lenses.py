@@ -3,30 +3,10 @@
 Notation: focal lengths fx, fy and principal point cx, cy in pixels; k radial, p tangential, in OpenCV's order.
 """
 
-import numpy as np
-
 from nerfcli.cameras.camera import Camera
-from nerfcli.captures.formats.fields import malformed
 from nerfcli.captures.formats.limits import checked_camera
 
 Pair = tuple[float, float]
-
-# Skew counts as rounding if it shifts the bottom of the picture by at most this much against its top.
-_NEGLIGIBLE_SKEW_PX = 0.02
-
-
-def camera_of_matrix(matrix: np.ndarray, size: tuple[int, int], where: str) -> Camera:
-    """Return the perspective camera without distortion of a matrix (3, 3) of intrinsics: fx, s, cx; 0, fy, cy; 0, 0, 1.
-
-    Raises:
-        UserError: the matrix is not of this form, its skew s is not 0, or a number is invalid; `where` is named.
-    """
-    (fx, skew, cx), (lower, fy, cy), last = matrix.tolist()
-    if lower != 0 or last != [0, 0, 1]:
-        raise malformed(where, "is not a matrix of intrinsics", "expected the rows fx 0 cx, 0 fy cy, 0 0 1")
-    if not abs(skew) * size[1] <= _NEGLIGIBLE_SKEW_PX * abs(fy):
-        raise malformed(where, f"its skew is {skew:g} px", "skew is not supported: no camera model here has it")
-    return checked_camera("PINHOLE", *size, (fx, fy, cx, cy), where=where)
 
 
 def brown_camera(
@@ -96,10 +76,4 @@ def spherical_camera(size: tuple[int, int], where: str) -> Camera:
     Raises:
         UserError: the picture is not twice as wide as high, so it cannot show the whole sphere.
     """
-    if abs(size[0] - 2 * size[1]) > 1:
-        raise malformed(
-            where,
-            f"invalid size of a spherical picture: {size[0]}x{size[1]} pixels",
-            "its width must be twice its height",
-        )
     return checked_camera("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), where=where)

@@ -1,12 +1,12 @@
 """Checks of the numbers in captures, which may be damaged even if the file parses: cameras, positions and poses."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, listed, several
 
 # Positions and depths in scene units. Beyond this, float64 cannot resolve a millimetre, even in UTM coordinates.
 MOST_UNITS = 1e12
@@ -21,6 +21,8 @@ MOST_PARAMETER = 1e12
 _MAX_DEVIATION = 1e-2
 # Rotations that deviate by less are kept, bit for bit.
 _ROUNDING = 1e-13
+# A rotation scaled by less is no rotation but an entry that was never filled.
+_LEAST_SCALE = 1e-9
 
 
 def plausible(positions: np.ndarray) -> np.ndarray:
@@ -43,6 +45,11 @@ def checked_camera(model: str, width: int, height: int, params: tuple[float, ...
         raise UserError(
             f"{where}: invalid camera parameters {', '.join(f'{value:g}' for value in params)}",
             f"every parameter must be a finite number below {MOST_PARAMETER:g}",
+        )
+    if model == "EQUIRECTANGULAR" and abs(width - 2 * height) > 1:
+        raise UserError(
+            f"{where}: invalid size of an EQUIRECTANGULAR picture: {width}x{height} pixels",
+            "a picture of the whole sphere is twice as wide as high; ordinary photos have another camera model",
         )
     try:
         return Camera(model, width, height, params)
@@ -71,7 +78,7 @@ def rigid_poses(matrices: np.ndarray, where: Callable[[int], str]) -> np.ndarray
         what=f"contains a number that is not finite or above {MOST_UNITS:g}",
         hint="the pose of this image is invalid; remove its entry",
     )
-    bend = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(axis=(1, 2), initial=0)
+    bend = _bend(rotations)
     _refuse(
         bend > _MAX_DEVIATION,
         where,
@@ -96,6 +103,117 @@ def rigid_pose(matrix: np.ndarray, where: str) -> np.ndarray:
     return rigid_poses(matrix[None], lambda _: where)[0]
 
 
+class NotFiniteError(UserError):
+    """A number in a file is infinite, NaN or null."""
+
+
+class FramePoses:
+    """Collects the poses of a capture's frames, and leaves out single ones that are unusable.
+
+    Programs write NaN, null or zeros where tracking was lost: the other frames are good. Rotations that are scaled
+    evenly, as by the size of an object in Blender, are normalised. Those that are scaled unevenly or mirrored are
+    mistakes of the whole file, and refused.
+    """
+
+    def __init__(self) -> None:
+        self._lost, self._scales, self._count = list[tuple[str, UserError]](), list[float](), 0
+
+    def read(self, name: str, where: str, matrix: Callable[[], np.ndarray]) -> np.ndarray | None:
+        """Return the pose (4, 4) of a frame, rigid, from the matrix (3, 4) or (4, 4) in the file; None if unusable.
+
+        Args:
+            where: the file and field of the matrix, to begin a message.
+            matrix: reads the matrix; a `NotFiniteError` says that this frame has none.
+
+        Raises:
+            UserError: the upper left block is mirrored, or neither a rotation nor an evenly scaled one.
+        """
+        found = self._checked(name, where, matrix)
+        return None if found is None else rigid_pose(found[0], where)
+
+    def read_inverse(self, name: str, where: str, matrix: Callable[[], np.ndarray]) -> np.ndarray | None:
+        """Return the inverse of a frame's matrix as `read` does: the scale applies to its fourth column, too."""
+        found = self._checked(name, where, matrix)
+        if found is None:
+            return None
+        scaled, scale = found
+        return rigid.inverse(rigid_pose(np.column_stack([scaled[:3, :3], scaled[:3, 3] / scale]), where))
+
+    def read_quaternion(
+        self, name: str, where: str, parts: Callable[[], tuple[np.ndarray, np.ndarray]]
+    ) -> np.ndarray | None:
+        """Return the pose (4, 4) of a frame from the quaternion xyzw and the position in the file; None if unusable."""
+        self._count += 1
+        try:
+            xyzw, position = parts()
+            if not xyzw.any():
+                raise NotFiniteError(f"{where}: its quaternion has length 0", "expected length 1")
+        except NotFiniteError as error:
+            self._lost.append((name, error))
+            return None
+        return quaternion_pose(xyzw, position, where)
+
+    def notes(self) -> tuple[str, ...]:
+        """Return what was left out and normalised, for people.
+
+        Raises:
+            UserError: fewer than two frames, or less than half of them, have a usable pose.
+        """
+        said = list(left_out(self._lost, self._count))
+        if self._scales:
+            low, high = min(self._scales), max(self._scales)
+            scale = f"{low:.4g}" if high - low < 1e-3 * high else f"{low:.4g} to {high:.4g}"
+            said.append(f"the rotations of {several(len(self._scales), 'frame')} are scaled by {scale}: normalised")
+        return tuple(said)
+
+    def _checked(self, name: str, where: str, matrix: Callable[[], np.ndarray]) -> tuple[np.ndarray, float] | None:
+        """Return a matrix with its rotation at length 1, and the scale that it had."""
+        self._count += 1
+        try:
+            found = matrix()
+            if not np.isfinite(found[:3]).all():
+                raise NotFiniteError(f"{where}: contains a number that is not finite", "expected a pose")
+            if not plausible(found[:3].reshape(1, -1)).all():
+                return found, 1.0  # for `rigid_pose` to refuse
+            scale = float(np.sqrt((found[:3, :3] ** 2).sum() / 3))
+            if scale < _LEAST_SCALE:
+                raise NotFiniteError(f"{where}: its rotation is zero", "expected a pose")
+        except NotFiniteError as error:
+            self._lost.append((name, error))
+            return None
+        if abs(scale - 1) <= _MAX_DEVIATION / 2:
+            return found, 1.0
+        even = found.copy()
+        even[:3, :3] /= scale
+        if _bend(even[None, :3, :3])[0] > _MAX_DEVIATION:
+            return found, 1.0
+        self._scales.append(scale)
+        return even, scale
+
+
+def left_out(lost: Sequence[tuple[str, UserError]], count: int) -> tuple[str, ...]:
+    """Return a line that names the frames that were left out, for people; none if there are none.
+
+    Args:
+        lost: their names, and why.
+        count: the number of frames with them.
+
+    Raises:
+        UserError: fewer than two of the frames remain, or less than half.
+    """
+    if not lost:
+        return ()
+    remaining = count - len(lost)
+    _, error = lost[0]
+    if remaining < 2 or 2 * remaining < count:
+        raise UserError(
+            f"{error.message}; only {remaining} of {several(count, 'frame')} can be used",
+            f"at least 2, and half of them, are needed: {error.hint}",
+        )
+    names = listed([name for name, _ in lost])
+    return (f"{len(lost)} of {several(count, 'frame')} left out: {names} ({error.message})",)
+
+
 def quaternion_pose(xyzw: np.ndarray, position: np.ndarray, where: str) -> np.ndarray:
     """Return the pose (4, 4) of a quaternion (4,) in the order x, y, z, w and a position (3,).
 
@@ -106,6 +224,11 @@ def quaternion_pose(xyzw: np.ndarray, position: np.ndarray, where: str) -> np.nd
     if abs(length - 1.0) > _MAX_DEVIATION:
         raise UserError(f"{where}: its quaternion has length {length:.4g}", "expected length 1")
     return rigid.from_parts(rigid.rotation_from_quaternion(xyzw[[3, 0, 1, 2]]), position)
+
+
+def _bend(rotations: np.ndarray) -> np.ndarray:
+    """Return by how much rotations (N, 3, 3) deviate from orthonormal."""
+    return np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(axis=(1, 2), initial=0)
 
 
 def _refuse(wrong: np.ndarray, where: Callable[[int], str], *, what: str, hint: str) -> None:

@@ -7,6 +7,7 @@ llff/poses/pose_utils.py, save_poses.
 """
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.format import Format, folder_of
-from nerfcli.captures.formats.limits import checked_camera, plausible, rigid_poses
+from nerfcli.captures.formats.limits import FramePoses, checked_camera, plausible
 from nerfcli.captures.formats.npy import DAMAGED, array_of_npy
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
 from nerfcli.errors import UserError
@@ -46,11 +47,21 @@ def parse_llff(folder: Path, *, images: Path | None = None) -> Capture:
     places = [place for place in (folder / name for name in IMAGE_FOLDERS) if place.is_dir()]
     places = places if images is None else [images]
     photos = _photos_of_rows(path, len(rows), places) if places else [None] * len(rows)
-    frames = [
-        Frame(f"image{index:03d}" if image is None else _name(image), camera, world_from_cam, image=image)
-        for index, (image, (camera, world_from_cam)) in enumerate(zip(photos, _views(path, rows), strict=True))
+    names = [f"image{index:03d}" if image is None else _name(image) for index, image in enumerate(photos)]
+    matrices, poses = rows[:, :15].reshape(-1, 3, 5), FramePoses()
+    views = [
+        poses.read(name, f"{path}: row {index}", partial(np.array, matrix[:, :4]))
+        for index, (name, matrix) in enumerate(zip(names, matrices, strict=True))
     ]
-    return Capture(tuple(frames), np.zeros((0, 3)), (), rows[:, 15:].copy(), "llff")
+    notes = poses.notes()
+    kept = [index for index, pose in enumerate(views) if pose is not None]
+    cameras = _cameras(path, rows, kept)
+    frames = [
+        Frame(names[index], camera, opencv_from_llff_pose(pose), image=photos[index])
+        for index, camera in zip(kept, cameras, strict=True)
+        if (pose := views[index]) is not None
+    ]
+    return Capture(tuple(frames), np.zeros((0, 3)), (), rows[kept, 15:].copy(), "llff", notes=notes)
 
 
 def losses_llff(capture: Capture) -> tuple[str, ...]:
@@ -98,21 +109,18 @@ def _read_rows(path: Path) -> np.ndarray:
     return rows.astype(np.float64)
 
 
-def _views(path: Path, rows: np.ndarray) -> list[tuple[Camera, np.ndarray]]:
-    """Return the camera and `world_from_cam` of each row; rows of equal intrinsics share one camera."""
-    matrices = rows[:, :15].reshape(-1, 3, 5)
-    poses = opencv_from_llff_pose(rigid_poses(matrices[:, :, :4], lambda index: f"{path}: row {index}"))
-    bad = ~((rows[:, 15] > 0) & (rows[:, 15] < rows[:, 16]) & plausible(rows[:, 15:]))
-    if bad.any():
-        index = int(np.argmax(bad))
-        near, far = rows[index, 15:]
+def _cameras(path: Path, rows: np.ndarray, kept: Sequence[int]) -> list[Camera]:
+    """Return the cameras of some rows; those of equal intrinsics share one."""
+    bad = [i for i in kept if not (0 < rows[i, 15] < rows[i, 16] and plausible(rows[i, 15:]))]
+    if bad:
+        near, far = rows[bad[0], 15:]
         raise UserError(
-            f"{path}: row {index}: depth bounds {near:g} and {far:g}",
+            f"{path}: row {bad[0]}: depth bounds {near:g} and {far:g}",
             "expected 0 < near < far in the last two columns",
         )
-    numbers = [tuple(row) for row in matrices[:, :, 4].tolist()]
-    cameras = {row: _camera(row, f"{path}: row {numbers.index(row)}") for row in dict.fromkeys(numbers)}
-    return [(cameras[row], pose) for row, pose in zip(numbers, poses, strict=True)]
+    numbers = {index: tuple(rows[index, 4:15:5].tolist()) for index in kept}
+    cameras = {row: _camera(row, f"{path}: row {index}") for index, row in reversed(numbers.items())}
+    return [cameras[row] for row in numbers.values()]
 
 
 def _photos_of_rows(path: Path, count: int, folders: Sequence[Path]) -> Sequence[Path]:

@@ -12,6 +12,9 @@ Source: Metashape Professional user manual, appendix "Camera models"; agisoft-ll
 src/export_for_gaussian_splatting.py (pixel centres, principal point, use of the transforms).
 """
 
+from collections import Counter
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import NoReturn
 from xml.etree import ElementTree
@@ -23,11 +26,14 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, numbers, shown, size_of
 from nerfcli.captures.formats.format import Format, by_suffix
-from nerfcli.captures.formats.limits import rigid_pose
+from nerfcli.captures.formats.lens_fits import Fits, Terms
+from nerfcli.captures.formats.lenses import spherical_camera
+from nerfcli.captures.formats.limits import FramePoses, rigid_pose
 from nerfcli.captures.formats.photo_names import with_photos
+from nerfcli.errors import listed as in_words
+from nerfcli.errors import several
 
 Element = ElementTree.Element
 
@@ -37,47 +43,79 @@ _FRAME = "frame"
 _FISHEYE = ("fisheye", "equidistant_fisheye")
 _SPHERICAL = "spherical"
 
-# A term that no camera model here has counts as rounding if it moves the edge of the picture by at most this much.
-_NEGLIGIBLE_PX = 1e-9
-
 
 def parse_metashape(path: Path) -> Capture:
     """Read the aligned cameras of the file's first chunk.
 
-    Cameras without a transform (not aligned, or a follower in a camera rig) and disabled ones give no frames, as in
-    Agisoft's own export script. If a component lacks a transform to the world, components are unrelated to each other,
-    and only the one with the most cameras is read. The file does not say where the photos are; a frame's name is the
-    camera's label. The unit stays arbitrary: a component's transform comes from georeferencing (then it is in metres)
-    or from moving the model by hand, and the file does not say which.
+    Cameras without a label or a transform (not aligned, or a follower in a camera rig), of a sensor that is not
+    calibrated, and disabled ones give no frames. If a component lacks a transform to the world, components are
+    unrelated to each other, and only the one with the most cameras is read. The file does not say where the photos are;
+    a frame's name is the camera's label, and where labels are equal, that of its group before it. The unit stays
+    arbitrary: a component's transform comes from georeferencing (then it is in metres) or from moving the model by
+    hand, and the file does not say which.
 
     Raises:
-        UserError: the file is damaged (file and field are named), or has a lens that no COLMAP model holds.
+        UserError: the file is damaged (file and field are named), has a lens that no COLMAP model holds, or equal
+            labels.
     """
     chunk = _chunk(path)
-    records = [record for record in chunk.iterfind("cameras//camera") if _is_aligned(record)]
+    groups = {camera: group.get("label", "") for group in chunk.iterfind("cameras/group") for camera in group}
+    listed = [camera for camera in chunk.iterfind("cameras//camera") if _is_enabled(camera)]
+    sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
+    reasons = {camera: _unusable(camera, sensors) for camera in listed}
+    records = [camera for camera in listed if not reasons[camera]]
+    if listed and not records:
+        first = f"{shown(listed[0].get('label'))} is {reasons[listed[0]]}"
+        raise malformed(str(path), f"lists no images with a pose: {first}", "align the photos, and export again")
+    notes = [_left_out(reason, reasons) for reason in dict.fromkeys(reasons.values()) if reason]
     worlds = _worlds_from_chunk(chunk, path)
     components = [record.get("component_id") for record in records]
     if None in (worlds.get(component) for component in components):
         kept = max(dict.fromkeys(components), key=components.count)
         records = [record for record in records if record.get("component_id") == kept]
-    sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
+    labels = Counter(record.get("label") for record in records)
     cameras: dict[str | None, Camera] = {}
-    frames = []
+    fits, poses, frames = Fits(), FramePoses(), []
     for record in records:
-        where = f"{path}: camera {shown(record.get('label'))}"
-        name = name_of(record.get("label"), where)
+        label = record.get("label")
+        where = f"{path}: camera {shown(label)}"
+        grouped = labels[label] > 1 and groups.get(record)
+        name = name_of(f"{groups[record]}/{label}" if grouped else label, where)
         sensor = record.get("sensor_id")
         if sensor not in sensors:
             raise malformed(where, f"sensor_id is {shown(sensor)}", "expected the id of one of the file's sensors")
         if sensor not in cameras:
-            cameras[sensor] = _camera(sensors[sensor], f"{path}: sensor {shown(sensor)}")
-        matrix = np.array(numbers(_words(record, "transform"), 16, f"{where}: transform")).reshape(4, 4)
-        chunk_from_cam = rigid_pose(matrix, f"{where}: transform")
+            cameras[sensor] = _camera(sensors[sensor], f"{path}: sensor {shown(sensor)}", fits)
+        place = f"{where}: transform"
+        chunk_from_cam = poses.read(name, place, partial(_matrix, record, place))
+        if chunk_from_cam is None:
+            continue
         world_from_chunk = worlds.get(record.get("component_id"))
         world_from_cam = chunk_from_cam if world_from_chunk is None else world_from_chunk.apply_pose(chunk_from_cam)
         frames.append(Frame(name, cameras[sensor], world_from_cam))
+    notes = (*notes, *poses.notes(), *fits.notes())
     check_unique_names((frame.name for frame in frames), path)
-    return Capture(tuple(frames), np.zeros((0, 3)), (), None, "metashape")
+    return Capture(tuple(frames), np.zeros((0, 3)), kind="metashape", notes=notes)
+
+
+def _unusable(camera: Element, sensors: Mapping[str | None, Element]) -> str:
+    """Return why a camera gives no frame; empty if it gives one."""
+    if not (camera.get("label") or "").strip():
+        return "without a label"
+    if camera.find("transform") is None:
+        return "not aligned"
+    sensor = sensors.get(camera.get("sensor_id"))
+    calibrated = sensor is None or _calibration(sensor).find("f") is not None or _kind_of(sensor) == _SPHERICAL
+    return "" if calibrated else "of a sensor without a calibration"
+
+
+def _left_out(reason: str, reasons: Mapping[Element, str]) -> str:
+    names = [camera.get("label") or f"id {camera.get('id')}" for camera, why in reasons.items() if why == reason]
+    return f"{len(names)} of {several(len(reasons), 'camera')} left out, {reason}: {in_words(names)}"
+
+
+def _matrix(record: Element, where: str) -> np.ndarray:
+    return np.array(numbers(_words(record, "transform"), 16, where)).reshape(4, 4)
 
 
 def _chunk(path: Path) -> Element:
@@ -113,8 +151,8 @@ def _parse_xml(path: Path) -> Element:
     return builder.close()
 
 
-def _is_aligned(record: Element) -> bool:
-    return record.find("transform") is not None and record.get("enabled", "true") not in ("false", "0")
+def _is_enabled(record: Element) -> bool:
+    return record.get("enabled", "true") not in ("false", "0")
 
 
 def _worlds_from_chunk(chunk: Element, path: Path) -> dict[str | None, rigid.Similarity | None]:
@@ -143,49 +181,39 @@ def _similarity(record: Element | None, where: str) -> rigid.Similarity | None:
     return rigid.Similarity(scale, pose[:3, :3], translation)
 
 
-def _camera(sensor: Element, where: str) -> Camera:
+def _calibration(sensor: Element) -> Element:
+    """Return the adjusted calibration of a sensor, else its initial one, else the sensor itself."""
     calibrations = sensor.findall("calibration")
     adjusted = [record for record in calibrations if record.get("class") == "adjusted"]
-    calibration = (adjusted or calibrations or [sensor])[0]
+    return (adjusted or calibrations or [sensor])[0]
+
+
+def _kind_of(sensor: Element) -> str | None:
+    kind = _calibration(sensor).get("type", sensor.get("type"))
+    return kind.lower() if kind else kind
+
+
+def _camera(sensor: Element, where: str, fits: Fits) -> Camera:
+    calibration, kind = _calibration(sensor), _kind_of(sensor)
     resolution = calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
     if resolution is None:
         raise malformed(where, "has no resolution", "expected the picture's size in pixels")
     width, height = numbers([resolution.get("width", ""), resolution.get("height", "")], 2, f"{where}: resolution")
     size = size_of(width, height, where)
-    kind = calibration.get("type", sensor.get("type"))
     if kind == _SPHERICAL:
-        return lenses.spherical_camera(size, where)
+        return spherical_camera(size, where)
     if kind != _FRAME and kind not in _FISHEYE:
         supported = ", ".join((_FRAME, *_FISHEYE, _SPHERICAL))
         raise malformed(where, f"camera type {shown(kind)} is not supported", f"expected one of {supported}")
-    if calibration.find("f") is None:
-        raise malformed(where, "has no focal length f", "align the photos before exporting the cameras")
     focal = _number(calibration, "f", where)
-    value = {
-        key: _number(calibration, key, where, default=0.0)
+    cx, cy, k1, k2, k3, k4, p1, p2, p3, p4, b1, b2 = (
+        _number(calibration, key, where, default=0.0)
         for key in ("cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
-    }
-    centre = (size[0] / 2 + value["cx"], size[1] / 2 + value["cy"])
-    _refuse_term("b2", value["b2"] * size[1] / max(abs(focal), 1e-9), "non-orthogonality (skew)", where)
-    for key in ("p3", "p4"):
-        _refuse_term(key, value[key] * focal, "a tangential term that Metashape dropped in version 1.6", where)
-    focals, tangential = (focal + value["b1"], focal), (value["p2"], value["p1"])
-    if kind in _FISHEYE:
-        radial = (value["k1"], value["k2"], value["k3"], value["k4"])
-        return lenses.fisheye_camera(size, focals, centre, radial=radial, tangential=tangential, where=where)
-    _refuse_term("k4", value["k4"] * focal, "a fourth radial term of a frame camera", where)
-    radial = (value["k1"], value["k2"], value["k3"])
-    return lenses.brown_camera(size, focals, centre, radial=radial, tangential=tangential, where=where)
-
-
-def _refuse_term(key: str, effect_px: float, what: str, where: str) -> None:
-    if abs(effect_px) > _NEGLIGIBLE_PX:
-        raise malformed(
-            where,
-            f"{key} is not 0: {what}, which is not supported",
-            f"set {key} to 0, or exclude it from the optimization (Optimize Cameras), and export again",
-        )
+    )
+    terms = Terms((k1, k2, k3, k4), (p2, p1), (p3, p4), b2, "b2")
+    make = fits.fisheye if kind in _FISHEYE else fits.brown
+    return make(size, (focal + b1, focal), (size[0] / 2 + cx, size[1] / 2 + cy), terms=terms, where=where)
 
 
 def _number(record: Element, key: str, where: str, *, default: float | None = None) -> float:

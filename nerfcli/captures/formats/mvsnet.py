@@ -11,17 +11,17 @@
 Source: YoYo000/MVSNet README, "File Formats", and colmap2mvsnet.py (principal points as in COLMAP).
 """
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from nerfcli.cameras import rigid
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, malformed, numbers, read_text
 from nerfcli.captures.formats.format import Format
-from nerfcli.captures.formats.lenses import camera_of_matrix
-from nerfcli.captures.formats.limits import rigid_pose
+from nerfcli.captures.formats.lens_fits import Fits
+from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
@@ -45,27 +45,33 @@ def parse_mvsnet(folder: Path, measure: Measure, *, images: Path | None = None) 
     stems = [file.name.removesuffix(CAMERA_FILES[1:]) for file in files]
     photos = find_photos(stems, (folder,), given=images, folders=IMAGE_FOLDERS)
     photos = photos.required(str(folder), "they give the names")
-    frames, bounds = [], []
-    for file, image in zip(files, photos.paths, strict=True):
-        cam_from_world, matrix, depths = _read(file)
-        if image is not None:
-            camera = camera_of_matrix(matrix, stored_size(image, measure), f"{file}: intrinsic")
-            frames.append(Frame(image.name, camera, rigid.inverse(cam_from_world), image=image))
-            bounds.append(depths)
+    fits, poses, frames, bounds = Fits(), FramePoses(), [], []
+    for file, stem, image in zip(files, stems, photos.paths, strict=True):
+        fields = _fields(file)
+        place = f"{file}: extrinsic"
+        pose = poses.read_inverse(stem, place, partial(_matrix, fields[1:17], 4, place))
+        matrix = _matrix(fields[18:27], 3, f"{file}: intrinsic")
+        depths = numbers(fields[27:], len(fields) - 27, f"{file}: depths")
+        if image is not None and pose is not None:
+            camera = fits.matrix(matrix, stored_size(image, measure), f"{file}: intrinsic")
+            frames.append(Frame(image.name, camera, pose, image=image))
+            bounds.append(_bounds(depths))
+    notes = (*photos.notes, *poses.notes(), *fits.notes())
     check_unique_names((frame.name for frame in frames), folder)
     known = np.array(bounds) if None not in bounds else None
-    return Capture(tuple(frames), np.zeros((0, 3)), photos.missing, known, "mvsnet", notes=photos.notes)
+    return Capture(tuple(frames), np.zeros((0, 3)), photos.missing, known, "mvsnet", notes=notes)
 
 
-def _read(file: Path) -> tuple[np.ndarray, np.ndarray, tuple[float, float] | None]:
-    """Return `cam_from_world` (4, 4), the matrix of intrinsics (3, 3), and nearest and farthest z if both are there."""
+def _fields(file: Path) -> list[str]:
+    """Return the words of a file: extrinsic, 16 numbers, intrinsic, 9 numbers, and up to 4 depths."""
     fields = read_text(file, _EXPECTED).split()
     if len(fields) < 27 or fields[0] != "extrinsic" or fields[17] != "intrinsic" or len(fields) > 31:
         raise malformed(str(file), "is not a camera of MVSNet", _EXPECTED)
-    pose = np.array(numbers(fields[1:17], 16, f"{file}: extrinsic")).reshape(4, 4)
-    matrix = np.array(numbers(fields[18:27], 9, f"{file}: intrinsic")).reshape(3, 3)
-    depths = numbers(fields[27:], len(fields) - 27, f"{file}: depths")
-    return rigid_pose(pose, f"{file}: extrinsic"), matrix, _bounds(depths)
+    return fields
+
+
+def _matrix(words: list[str], side: int, where: str) -> np.ndarray:
+    return np.array(numbers(words, side * side, where)).reshape(side, side)
 
 
 def _bounds(depths: list[float]) -> tuple[float, float] | None:

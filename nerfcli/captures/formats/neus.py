@@ -18,7 +18,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed
 from nerfcli.captures.formats.format import Format, named
-from nerfcli.captures.formats.lenses import camera_of_matrix
+from nerfcli.captures.formats.lens_fits import Fits
 from nerfcli.captures.formats.limits import plausible
 from nerfcli.captures.formats.npy import DAMAGED, array_of_npy, members_of_npz
 from nerfcli.captures.formats.photo_names import GIVE_PHOTOS
@@ -62,12 +62,12 @@ def parse_neus(path: Path, measure: Measure, *, images: Path | None = None) -> C
     names = [f"world_mat_{index}" for index in range(count)]
     views = [_decomposed(_projection(members[name], f"{path}: {name}"), f"{path}: {name}") for name in names]
     matrices = _without_rounding(np.array([matrix for matrix, _ in views]))
-    frames = []
+    fits, frames = Fits(), []
     for index, (image, matrix) in enumerate(zip(photos, matrices, strict=True)):
-        camera = camera_of_matrix(matrix, stored_size(image, measure), f"{path}: {names[index]}")
+        camera = fits.matrix(matrix, stored_size(image, measure), f"{path}: {names[index]}")
         mask = masks[index] if len(masks) == count else None
         frames.append(Frame(image.name, camera, views[index][1], image=image, mask=mask))
-    return Capture(tuple(frames), np.zeros((0, 3)), (), None, "neus")
+    return Capture(tuple(frames), np.zeros((0, 3)), kind="neus", notes=fits.notes())
 
 
 def _without_rounding(matrices: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ opensfm/src/geometry/camera_{projections,distortions}_functions.h.
 """
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from nerfcli.captures.formats.fields import (
     vector,
 )
 from nerfcli.captures.formats.format import Format, find_json
-from nerfcli.captures.formats.limits import checked_camera, plausible
+from nerfcli.captures.formats.limits import FramePoses, checked_camera, plausible
 from nerfcli.captures.formats.photo_names import with_photos
 from nerfcli.captures.formats.unsupported import distortion, lost_of_cameras, lost_parts, projection
 from nerfcli.errors import UserError
@@ -87,19 +88,21 @@ def parse_opensfm(path: Path) -> Capture:
     content = _largest(path)
     camera_records = record_of(content.get("cameras"), f"{path}: cameras")
     cameras = {key: _camera(record, f"{path}: cameras.{shown(key)}") for key, record in camera_records.items()}
-    frames = []
-    poses = _poses(content["shots"], path)
-    for (key, record), world_from_cam in zip(content["shots"].items(), poses, strict=True):
+    frames, poses = [], FramePoses()
+    for key, record in content["shots"].items():
         where = f"{path}: shots.{shown(key)}"
         name = name_of(key, where)
         camera = record.get("camera")
         if not isinstance(camera, str) or camera not in cameras:
             raise malformed(where, f"camera is {shown(camera)}", "expected a key of cameras")
-        frames.append(Frame(name, cameras[camera], world_from_cam, image=path.parent / IMAGE_FOLDER / name))
+        pose = poses.read_inverse(name, where, partial(_matrix, record, where))
+        if pose is not None:
+            frames.append(Frame(name, cameras[camera], pose, image=path.parent / IMAGE_FOLDER / name))
+    notes = poses.notes()
     check_unique_names((frame.name for frame in frames), path)
     points, colours = _points(content, path)
     unit = "metre" if _is_on_earth(content, path) else "arbitrary"
-    return Capture(tuple(frames), points, (), None, "opensfm", colours=colours, unit=unit)
+    return Capture(tuple(frames), points, (), None, "opensfm", colours=colours, unit=unit, notes=notes)
 
 
 def losses_opensfm(capture: Capture) -> tuple[str, ...]:
@@ -154,6 +157,7 @@ def _largest(path: Path) -> dict[str, Any]:
 def _camera(value: Any, where: str) -> Camera:
     record = record_of(value, where)
     kind = record.get("projection_type", "perspective")
+    kind = kind.lower() if isinstance(kind, str) else kind
     size = size_of(number(record, "width", where), number(record, "height", where), where)
     if kind in _SPHERICAL:
         return lenses.spherical_camera(size, where)
@@ -213,14 +217,10 @@ def _camera_record(camera: Camera) -> dict[str, Any]:
     return {"projection_type": kind, **size, **intrinsics, **terms}
 
 
-def _poses(shots: dict[str, Any], path: Path) -> np.ndarray:
-    """Return `world_from_cam` (shots, 4, 4)."""
-    rows = [
-        (vector(shot, "rotation", 3, where), vector(shot, "translation", 3, where))
-        for where, shot in ((f"{path}: shots.{shown(key)}", shot) for key, shot in shots.items())
-    ]
-    rotations, translations = np.array(rows).reshape(-1, 2, 3).swapaxes(0, 1)
-    return rigid.inverse(rigid.from_parts(Rotation.from_rotvec(rotations).as_matrix(), translations))
+def _matrix(shot: dict[str, Any], where: str) -> np.ndarray:
+    """Return the first three rows of cam_from_world, (3, 4)."""
+    rotation, translation = vector(shot, "rotation", 3, where), vector(shot, "translation", 3, where)
+    return np.column_stack([Rotation.from_rotvec(rotation).as_matrix(), translation])
 
 
 def _points(content: dict[str, Any], path: Path) -> tuple[np.ndarray, np.ndarray | None]:

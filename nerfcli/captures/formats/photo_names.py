@@ -167,7 +167,7 @@ def _described(names: Sequence[Name], search: Search | None) -> FoundPhotos:
     renamed = [
         index
         for index, (name, seen) in enumerate(zip(names, inside, strict=True))
-        if seen is not None and not _is_expected(name, seen, place)
+        if seen is not None and search.paths[index] != Path(name.plain) and not _is_expected(name, seen, place)
     ]
     if renamed:
         index = renamed[0]

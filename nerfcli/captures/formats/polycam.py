@@ -7,7 +7,9 @@ have cameras/ and images/ only.
 Source: PolyCam/polyform README.md, "Polycam's data format", and polyform/convertors/instant_ngp.py.
 """
 
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +18,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, number, read_json_object, size_of
 from nerfcli.captures.formats.format import Format
-from nerfcli.captures.formats.limits import checked_camera, rigid_pose
+from nerfcli.captures.formats.limits import FramePoses, checked_camera
 from nerfcli.captures.formats.photo_names import find_photos
 
 FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
@@ -42,21 +44,22 @@ def parse_polycam(folder: Path, *, images: Path | None = None) -> Capture:
     """
     found = polycam_folders(folder)
     assert found is not None
-    stems, views = [], []
+    stems, views, poses = [], [], FramePoses()
     for file in sorted(found[0].glob("*.json"), key=lambda file: (len(file.stem), file.stem)):
         where, record = str(file), read_json_object(file)
-        fx, fy, cx, cy, *pose = (number(record, key, where) for key in ("fx", "fy", "cx", "cy", *_POSE))
+        fx, fy, cx, cy = (number(record, key, where) for key in ("fx", "fy", "cx", "cy"))
         size = size_of(number(record, "width", where), number(record, "height", where), where)
         camera = checked_camera("PINHOLE", *size, (fx, fy, cx, cy), where=where)
         stems.append(file.stem)
-        views.append((camera, opencv_from_opengl_pose(rigid_pose(np.array(pose).reshape(3, 4), where))))
+        views.append((camera, poses.read(file.stem, where, partial(_matrix, record, where))))
     sizes = [camera.size for camera, _ in views]
     photos = find_photos(stems, (found[1],), given=images, sizes=sizes).required(str(folder), "they give the names")
     frames = [
-        Frame(image.name, camera, pose, image=image)
+        Frame(image.name, camera, opencv_from_opengl_pose(pose), image=image)
         for image, (camera, pose) in zip(photos.paths, views, strict=True)
-        if image is not None
+        if image is not None and pose is not None
     ]
+    notes = (*photos.notes, *poses.notes())
     check_unique_names((frame.name for frame in frames), folder)
     return Capture(
         tuple(frames),
@@ -65,8 +68,13 @@ def parse_polycam(folder: Path, *, images: Path | None = None) -> Capture:
         kind="polycam",
         unit="metre",
         unit_source="LiDAR (Polycam)",
-        notes=photos.notes,
+        notes=notes,
     )
+
+
+def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
+    """Return the first three rows of world_from_cam, (3, 4)."""
+    return np.array([number(record, key, where) for key in _POSE]).reshape(3, 4)
 
 
 def find_polycam(path: Path) -> Path | None:

@@ -11,9 +11,9 @@ Source: ScanNet SensReader; Microsoft 7-Scenes readme.txt; facebookresearch/NSVF
 (load_intrinsics, load_matrix); vsitzmann/scene-representation-networks util.py (parse_intrinsics).
 """
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +23,8 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, size_of
 from nerfcli.captures.formats.format import Format
-from nerfcli.captures.formats.lenses import camera_of_matrix
-from nerfcli.captures.formats.limits import checked_camera, rigid_pose
+from nerfcli.captures.formats.lens_fits import Fits
+from nerfcli.captures.formats.limits import FramePoses, checked_camera
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, FoundPhotos, find_photos
 from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
@@ -79,16 +79,25 @@ def parse_pose_files(
     files = pose_files(folder)
     stems = [file.name.removesuffix(".txt").removesuffix(".pose") for file in files]
     photos = _photos(stems, (folder, files[0].parent), images).required(str(folder), "they give the names")
-    camera_of_size, frames = _cameras(folder, camera), []
+    fits, poses, frames = Fits(), FramePoses(), []
+    camera_of_size = _cameras(folder, camera, fits)
     names_give_splits = all(file.name[:2] in _SPLITS for file in files)
     for file, stem, image in zip(files, stems, photos.paths, strict=True):
-        world_from_cam = _pose(file)
+        world_from_cam = poses.read(stem, str(file), partial(_matrix, file))
         if image is not None and world_from_cam is not None:
             own_camera = camera_of_size(stored_size(image, measure))
             split = _SPLITS[stem[:2]] if names_give_splits else None
             frames.append(Frame(image.name, own_camera, world_from_cam, image=image, split=split))
+    notes = (*photos.notes, *poses.notes(), *fits.notes())
     check_unique_names((frame.name for frame in frames), folder)
-    return Capture(tuple(frames), np.zeros((0, 3)), photos.missing, None, "pose-files", notes=photos.notes)
+    return Capture(
+        tuple(frames),
+        np.zeros((0, 3)),
+        photos.missing,
+        None,
+        "pose-files",
+        notes=notes,
+    )
 
 
 def _photos(stems: list[str], homes: tuple[Path, ...], images: Path | None) -> FoundPhotos:
@@ -100,25 +109,15 @@ def _photos(stems: list[str], homes: tuple[Path, ...], images: Path | None) -> F
     return replace(colour, listed=tuple(stems))
 
 
-def _pose(file: Path) -> np.ndarray | None:
-    """Return `world_from_cam` (4, 4); None if it has numbers that are not finite."""
+def _matrix(file: Path) -> np.ndarray:
+    """Return the matrix in a file, (3, 4) or (4, 4)."""
     fields = read_text(file, _EXPECTED).split()
     if len(fields) not in (12, 16):
         raise malformed(str(file), f"has {len(fields)} numbers", _EXPECTED)
-    if not _is_tracked(fields):
-        return None
-    return rigid_pose(np.array(numbers(fields, len(fields), str(file))).reshape(-1, 4), str(file))
+    return np.array(numbers(fields, len(fields), str(file))).reshape(-1, 4)
 
 
-def _is_tracked(fields: Sequence[str]) -> bool:
-    """Return False if a number is infinite or NaN, as ScanNet writes the pose of a photo that was not tracked."""
-    try:
-        return all(math.isfinite(float(field)) for field in fields)
-    except ValueError:
-        return True  # not a number at all: an error that `numbers` reports
-
-
-def _cameras(folder: Path, camera: Camera | None) -> Callable[[tuple[int, int]], Camera]:
+def _cameras(folder: Path, camera: Camera | None, fits: Fits) -> Callable[[tuple[int, int]], Camera]:
     """Return the function that gives the camera of photos with a size."""
     if camera is not None:
         return lambda size: camera.resized(*size)
@@ -132,7 +131,7 @@ def _cameras(folder: Path, camera: Camera | None) -> Callable[[tuple[int, int]],
     lengths = [len(row) for row in rows]
     if lengths in ([3] * 3, [4] * 3, [4] * 4):
         matrix = np.array([numbers(row, len(row), str(path)) for row in rows])[:3, :3]
-        return lambda size: camera_of_matrix(matrix, size, str(path))
+        return lambda size: fits.matrix(matrix, size, str(path))
     if len(rows) < 2 or lengths[0] != 4 or lengths[-1] != 2:
         raise malformed(
             str(path),

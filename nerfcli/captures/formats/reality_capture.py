@@ -23,12 +23,14 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats import lenses
-from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, numbers, read_text, shown
+from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, numbers, read_text
 from nerfcli.captures.formats.format import Format, by_suffix, only_file
+from nerfcli.captures.formats.lens_fits import Fits, Terms
+from nerfcli.captures.formats.limits import NotFiniteError, left_out
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
+from nerfcli.errors import UserError
 
 _EXPECTED = 'expected a file of RealityScan\'s export "Internal/External camera parameters"'
 
@@ -56,23 +58,29 @@ def parse_reality_capture(path: Path, measure: Measure, *, images: Path | None =
         UserError: the file is damaged (file and line are named), has a lens that no COLMAP model holds, or none of its
             photos is on disk.
     """
-    names, rows, places = _table(path)
+    names, rows, places, lost = _table(path)
     found = find_photos(names, (path.parent,), given=images).required(str(path), "the file does not give their sizes")
     value = {key: rows[:, index] for index, key in enumerate(_NUMBERS)}
     angles = np.stack([-value["heading"], value["pitch"], value["roll"]], axis=-1)
     rotations = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
     poses = opencv_from_opengl_pose(rigid.from_parts(rotations, rows[:, :3]))
-    frames = []
+    fits, frames = Fits(), []
     for index, (name, image) in enumerate(zip(found.names, found.paths, strict=True)):
         if image is not None:
             intrinsics: dict[str, float] = dict(zip(_NUMBERS[6:], rows[index, 6:].tolist(), strict=True))
-            camera = _camera(intrinsics, stored_size(image, measure), places[index])
+            camera = _camera(intrinsics, stored_size(image, measure), places[index], fits)
             frames.append(Frame(name, camera, poses[index], image=image))
-    return Capture(tuple(frames), np.zeros((0, 3)), found.missing, kind="reality_capture", notes=found.notes)
+    notes = (*found.notes, *lost, *fits.notes())
+    return Capture(tuple(frames), np.zeros((0, 3)), found.missing, kind="reality_capture", notes=notes)
 
 
-def _table(path: Path) -> tuple[list[str], np.ndarray, list[str]]:
-    """Return the images' names, their numbers (images, 15) in the order of `_NUMBERS`, and their places in the file."""
+def _table(path: Path) -> tuple[list[str], np.ndarray, list[str], tuple[str, ...]]:
+    """Return the table of the images, without those whose numbers are not finite.
+
+    Returns:
+        The images' names, their numbers (images, 15) in the order of `_NUMBERS`, their places in the file, and a note
+        about what was left out.
+    """
     lines = read_text(path, _EXPECTED).splitlines()
     start = next((index for index, line in enumerate(lines) if line.lower().startswith(("#name,", "name,"))), None)
     if start is None:
@@ -84,7 +92,7 @@ def _table(path: Path) -> tuple[list[str], np.ndarray, list[str]]:
         if not found:
             raise malformed(f"{path}: line {start + 1}", f"has no column {' or '.join(spellings)}", _EXPECTED)
         columns[key] = found[0]
-    names, rows, places = [], [], []
+    names, rows, places, lost = [], [], [], list[tuple[str, UserError]]()
     for index, line in enumerate(lines[start + 1 :], start=start + 2):
         if not line.strip():
             continue
@@ -92,11 +100,17 @@ def _table(path: Path) -> tuple[list[str], np.ndarray, list[str]]:
         words = _cells(line, where)
         if len(words) != len(header):
             raise malformed(where, f"has {len(words)} columns", f"expected {len(header)}, as in the file's first line")
-        names.append(name_of(words[columns["name"]], where))
-        rows.append(numbers([words[columns[key]] for key in _NUMBERS], len(_NUMBERS), where))
+        name = name_of(words[columns["name"]], where)
+        try:
+            rows.append(numbers([words[columns[key]] for key in _NUMBERS], len(_NUMBERS), where))
+        except NotFiniteError as error:
+            lost.append((name, error))
+            continue
+        names.append(name)
         places.append(where)
+    notes = left_out(lost, len(names) + len(lost))
     check_unique_names(names, path)
-    return names, np.array(rows), places
+    return names, np.array(rows), places, notes
 
 
 def _cells(line: str, where: str) -> list[str]:
@@ -109,18 +123,12 @@ def _cells(line: str, where: str) -> list[str]:
         raise malformed(where, f"is not a valid line of a table ({error})", _EXPECTED) from error
 
 
-def _camera(value: dict[str, float], size: tuple[int, int], where: str) -> Camera:
+def _camera(value: dict[str, float], size: tuple[int, int], where: str, fits: Fits) -> Camera:
     scale = max(size)
     focal = (value["f"] / 36 * scale,) * 2
     centre = (size[0] / 2 + value["px"] * scale, size[1] / 2 + value["py"] * scale)
-    if value["k4"] != 0:
-        raise malformed(
-            where,
-            f"k4 is {shown(value['k4'])}: a fourth radial term, which is not supported",
-            "align with the distortion model Brown3 or Brown3 with tangential2, and export again",
-        )
-    radial, tangential = (value["k1"], value["k2"], value["k3"]), (value["t2"], value["t1"])
-    return lenses.brown_camera(size, focal, centre, radial=radial, tangential=tangential, where=where)
+    terms = Terms((value["k1"], value["k2"], value["k3"], value["k4"]), (value["t2"], value["t1"]))
+    return fits.brown(size, focal, centre, terms=terms, where=where)
 
 
 def find_reality_capture(path: Path) -> Path | None:

@@ -6,6 +6,7 @@ absent. w and h: the size of the pictures that these numbers are for. Read only.
 Source: nerfstudio process_data/record3d_utils.py; record3d.app, "Format of .r3d files".
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed, number, read_json_object, shown, size_of, vector
 from nerfcli.captures.formats.format import Format, has_keys, named
-from nerfcli.captures.formats.limits import checked_camera, quaternion_pose
+from nerfcli.captures.formats.limits import FramePoses, checked_camera
 from nerfcli.captures.formats.photo_names import find_photos
 
 FILES = ("metadata.json", "metadata")
@@ -49,14 +50,14 @@ def parse_record3d(path: Path, *, images: Path | None = None) -> Capture:
     stems, sizes = [str(index) for index in range(len(poses))], [size] * len(poses)
     photos = find_photos(stems, (path.parent,), given=images, folders=IMAGE_FOLDERS, sizes=sizes)
     photos = photos.required(where, "they give the names")
-    intrinsics, frames = _intrinsics(content, len(poses), where).tolist(), []
+    usable, frames = FramePoses(), []
+    intrinsics = _intrinsics(content, len(poses), where).tolist()
     for index, (pose, image) in enumerate(zip(poses, photos.paths, strict=True)):
         place = f"{where}: {_POSES}[{index}]"
-        row = vector({"pose": pose}, "pose", 7, place)
-        world_from_cam = opencv_from_opengl_pose(quaternion_pose(row[:4], row[4:], place))
-        if image is not None:
+        world_from_cam = usable.read_quaternion(str(index), place, partial(_parts, pose, place))
+        if image is not None and world_from_cam is not None:
             camera = checked_camera("PINHOLE", *size, tuple(intrinsics[index]), where=where)
-            frames.append(Frame(image.name, camera, world_from_cam, image=image))
+            frames.append(Frame(image.name, camera, opencv_from_opengl_pose(world_from_cam), image=image))
     return Capture(
         tuple(frames),
         np.zeros((0, 3)),
@@ -64,8 +65,14 @@ def parse_record3d(path: Path, *, images: Path | None = None) -> Capture:
         kind="record3d",
         unit="metre",
         unit_source="ARKit (Record3D)",
-        notes=photos.notes,
+        notes=(*photos.notes, *usable.notes()),
     )
+
+
+def _parts(pose: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the quaternion xyzw and the position of a pose."""
+    row = vector({"pose": pose}, "pose", 7, where)
+    return row[:4], row[4:]
 
 
 def _intrinsics(content: dict[str, Any], count: int, where: str) -> np.ndarray:

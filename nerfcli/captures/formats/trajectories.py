@@ -18,7 +18,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, shown
 from nerfcli.captures.formats.format import Format
-from nerfcli.captures.formats.limits import quaternion_pose, rigid_pose
+from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, with_photos
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts
 from nerfcli.errors import UserError
@@ -91,7 +91,7 @@ def write_kitti(capture: Capture, path: Path) -> None:
 def _parse(
     path: Path,
     camera: Camera | None,
-    pose_of: Callable[[int, list[str], str], tuple[str, np.ndarray]],
+    pose_of: Callable[[FramePoses, int, list[str], str], tuple[str, np.ndarray | None]],
     *,
     expected: str,
     kind: str,
@@ -101,28 +101,35 @@ def _parse(
             f"{path}: a {kind.upper()} trajectory contains poses but no camera",
             GIVE_CAMERA,
         )
-    frames = []
+    poses, frames = FramePoses(), []
     for index, (number, line) in enumerate(content_lines(read_text(path, expected))):
-        name, world_from_cam = pose_of(index, line.split(), f"{path}: line {number}")
-        frames.append(Frame(name, camera, world_from_cam))
+        name, world_from_cam = pose_of(poses, index, line.split(), f"{path}: line {number}")
+        if world_from_cam is not None:
+            frames.append(Frame(name, camera, world_from_cam))
+    notes = poses.notes()
     if not frames:
         raise malformed(str(path), "has no pose", expected)
     check_unique_names((frame.name for frame in frames), path)
-    return Capture(tuple(frames), np.zeros((0, 3)), (), None, kind)
+    return Capture(tuple(frames), np.zeros((0, 3)), kind=kind, notes=notes)
 
 
-def _tum_pose(_: int, words: list[str], where: str) -> tuple[str, np.ndarray]:
+def _tum_pose(poses: FramePoses, _: int, words: list[str], where: str) -> tuple[str, np.ndarray | None]:
     if len(words) != 8:
         raise malformed(where, f"has {len(words)} numbers", "expected 8")
-    values = np.array(numbers(words[1:], 7, where))
-    world_from_cam = quaternion_pose(values[3:], values[:3], where)
+
+    def parts() -> tuple[np.ndarray, np.ndarray]:
+        values = np.array(numbers(words[1:], 7, where))
+        return values[3:], values[:3]
+
+    world_from_cam = poses.read_quaternion(words[0], where, parts)
     if not _NUMBER.fullmatch(words[0]):
         raise malformed(where, f"its timestamp is {shown(words[0])}", "expected seconds, such as 1305031102.1753")
     return words[0], world_from_cam
 
 
-def _kitti_pose(index: int, words: list[str], where: str) -> tuple[str, np.ndarray]:
-    return _indexed(index), rigid_pose(np.array(numbers(words, 12, where)).reshape(3, 4), where)
+def _kitti_pose(poses: FramePoses, index: int, words: list[str], where: str) -> tuple[str, np.ndarray | None]:
+    name = _indexed(index)
+    return name, poses.read(name, where, lambda: np.array(numbers(words, 12, where)).reshape(3, 4))
 
 
 def _indexed(index: int) -> str:

@@ -6,6 +6,7 @@ Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips
 
 from collections import Counter
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -20,7 +21,8 @@ from nerfcli.captures.formats.alicevision import find_alicevision
 from nerfcli.captures.formats.camera_path import find_camera_path
 from nerfcli.captures.formats.fields import malformed, read_json_object
 from nerfcli.captures.formats.format import Format, find_json
-from nerfcli.captures.formats.limits import rigid_poses
+from nerfcli.captures.formats.lens_fits import Fits
+from nerfcli.captures.formats.limits import FramePoses, NotFiniteError
 from nerfcli.captures.formats.photo_names import find_photos, seen_from
 from nerfcli.captures.formats.photo_search import plain_name
 from nerfcli.captures.formats.ply import read_points, write_points
@@ -58,8 +60,8 @@ def parse_transforms(path: Path, measure: Measure | None = None, *, images: Path
     content = read_json_object(path)
     frames, missing, notes = listed_frames(path, content, measure, images=images)
     check_unique_names(path, frames)
-    points, colours = _points_beside(path, content)
-    return Capture(tuple(frames), points, tuple(missing), None, "transforms", colours=colours, notes=notes)
+    points, colours, lost = _points_beside(path, content)
+    return Capture(tuple(frames), points, tuple(missing), kind="transforms", colours=colours, notes=(*notes, *lost))
 
 
 def losses_transforms(capture: Capture) -> tuple[str, ...]:
@@ -142,7 +144,6 @@ def listed_frames(
         size: of the images, if the file does not give it and none is on disk.
     """
     records = records_of(path, content)
-    poses = _poses(path, records)
     merged = [{**content, **record} for record in records]
     wheres = [f"{path}: frames[{index}]" for index in range(len(records))]
     sizes = [given_size(record, where) for record, where in zip(merged, wheres, strict=True)]
@@ -161,17 +162,21 @@ def listed_frames(
     masks, lost_masks = _masks(path, [record.get("mask_path") for record in merged], wheres, set(places))
     splits = _listed_splits(path, content)
     cameras: dict[Camera, Camera] = {}
+    fits, poses = Fits(), FramePoses()
     frames, missing = [], []
-    for index, (record, where, own_size, pose) in enumerate(zip(merged, wheres, known, poses, strict=True)):
+    for index, (record, where, own_size) in enumerate(zip(merged, wheres, known, strict=True)):
+        matrix = poses.read(names[index], f"{where}.transform_matrix", partial(_matrix, record, where))
         if own_size is None:
             missing.append(names[index])
             continue
-        camera = camera_of_record(record, own_size, where)
+        if matrix is None:
+            continue
+        camera, pose = camera_of_record(record, own_size, where, fits), opencv_from_opengl_pose(matrix)
         split = splits.get(plain_name(texts[index]))
         frames.append(
             Frame(names[index], cameras.setdefault(camera, camera), pose, places[index], masks[index], split=split)
         )
-    return frames, missing, (*found.notes, *lost_masks)
+    return frames, missing, (*found.notes, *poses.notes(), *fits.notes(), *lost_masks)
 
 
 def _masks(
@@ -224,17 +229,12 @@ def _listed_path(record: dict[str, Any], where: str) -> str:
     return text
 
 
-def _poses(path: Path, records: list[dict[str, Any]]) -> np.ndarray:
-    """Return `world_from_cam` (frames, 4, 4), OpenCV axes, rigid."""
-    matrices = np.stack([_matrix(record, f"{path}: frames[{index}]")[:3] for index, record in enumerate(records)])
-    rigid = rigid_poses(matrices, lambda index: f"{path}: frames[{index}].transform_matrix")
-    return opencv_from_opengl_pose(rigid)
-
-
 def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
     """Return the matrix of a frame, (4, 4) or (3, 4)."""
     if "transform_matrix" not in record:
         raise malformed(where, "transform_matrix is missing", "expected 4 rows of 4 numbers, world from camera")
+    if record["transform_matrix"] is None:
+        raise NotFiniteError(f"{where}: transform_matrix is null", "expected 4 rows of 4 numbers, world from camera")
     try:
         matrix = np.array(record["transform_matrix"], dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -244,15 +244,23 @@ def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
     return matrix
 
 
-def _points_beside(path: Path, content: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Read points (N, 3) and colours (N, 3) of the PLY file that ply_file_path names; no points if it is not given."""
+def _points_beside(path: Path, content: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
+    """Read points (N, 3) and colours (N, 3) of the PLY file that ply_file_path names; no points if it is not given.
+
+    Returns:
+        The points, their colours, and a note if there is no such file.
+    """
     cloud = content.get("ply_file_path")
-    if cloud is None:
-        return np.zeros((0, 3)), None
-    if not isinstance(cloud, str) or not cloud:
+    if cloud is None or cloud == "":
+        return np.zeros((0, 3)), None, ()
+    if not isinstance(cloud, str):
         raise malformed(str(path), f"ply_file_path is {cloud!r:.80}", "expected the path of a PLY file as text")
+    places = (path.parent / plain_name(cloud), path.parent / PurePosixPath(plain_name(cloud)).name)
+    place = next((place for place in places if place.is_file()), None)
+    if place is None:
+        return np.zeros((0, 3)), None, (f"{cloud}, which {path.name} names, does not exist: no points are read",)
     try:
-        return read_points(path.parent / cloud.replace("\\", "/"))
+        return *read_points(place), ()
     except UserError as error:
         raise malformed(f"{path}: ply_file_path", error.message, error.hint) from error
 

@@ -4,10 +4,13 @@ Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips
 """
 
 import math
+from contextlib import suppress
 from typing import Any
 
 from nerfcli.cameras.camera import Camera
+from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import malformed
+from nerfcli.captures.formats.lens_fits import Fits, Terms
 from nerfcli.captures.formats.limits import checked_camera
 from nerfcli.captures.formats.unsupported import distortion, projection
 
@@ -33,20 +36,22 @@ _KEY_OF_TERM = {
 }
 
 
-def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str) -> Camera:
+def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, fits: Fits) -> Camera:
     """Return the camera of a frame.
 
     Args:
         record: the frame's keys, merged over those of the whole file.
         size: of the picture that the numbers are for.
+        fits: takes a note where the terms are fitted by others.
 
     Raises:
         UserError: no focal length, an invalid number, or an unknown lens model.
     """
     width, height = size
     model = record.get("camera_model")
+    model = model.upper() if isinstance(model, str) else model
     if model == "EQUIRECTANGULAR":
-        return checked_camera("EQUIRECTANGULAR", width, height, (width, height), where=where)
+        return lenses.spherical_camera(size, where)
     foreign = next((key for key in _FOREIGN if record.get(key) not in (None, False)), None)
     if foreign is not None:
         raise malformed(where, f"the lens model of {foreign} is not supported", "undistort the pictures first")
@@ -63,14 +68,13 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str) 
     head = (fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
     k1, k2, k3, k4, p1, p2 = (number(record, key, where) or 0.0 for key in _INTRINSICS)
     if model in _FISHEYE_MODELS or record.get("is_fisheye") is True:
-        if p1 or p2:
-            raise malformed(where, "a fisheye camera with p1 or p2", "expected k1 to k4 only (OpenCV's fisheye)")
-        return checked_camera("OPENCV_FISHEYE", width, height, (*head, k1, k2, k3, k4), where=where)
+        radial, tangential = (k1, k2, k3, k4), (p1, p2)
+        return lenses.fisheye_camera(size, head[:2], head[2:], radial=radial, tangential=tangential, where=where)
     if model not in _PERSPECTIVE_MODELS:
         supported = ", ".join(str(name) for name in (*_PERSPECTIVE_MODELS[1:], *_FISHEYE_MODELS, "EQUIRECTANGULAR"))
         raise malformed(where, f"camera_model {model!r:.80} is not supported", f"expected one of {supported}")
     if k4:
-        raise malformed(where, f"k4 is {k4} without a fisheye camera", "k1, k2, k3, p1, p2 are the perspective terms")
+        return fits.brown(size, head[:2], head[2:], terms=Terms((k1, k2, k3, k4), (p1, p2)), where=where)
     if k3:
         params = (*head, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
         return checked_camera("FULL_OPENCV", width, height, params, where=where)
@@ -122,6 +126,9 @@ def number(record: dict[str, Any], key: str, where: str) -> float | None:
     value = record.get(key)
     if value is None:
         return None
+    if isinstance(value, str):
+        with suppress(ValueError):
+            value = float(value)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:  # True at NaN
         raise malformed(where, f"{key} is {value!r:.80}", "expected a finite number")
     return float(value)
