@@ -154,6 +154,11 @@ def test_a_folder_of_another_name_is_no_other_folder_of_the_same_photo(tmp_path)
     assert find(tmp_path, ["left/a.png"]).paths == (None,)
 
 
+def test_a_photo_that_was_moved_to_a_subfolder_is_not_brought_back(tmp_path):
+    photos(tmp_path / "images", ["a.png", "rejected/b.png"])
+    assert levels(find(tmp_path, ["a.png", "b.png"]).paths) == [0, None]
+
+
 @pytest.mark.parametrize("write", [colmap, transforms])
 def test_a_conversion_names_missing_photos_and_fails_without_any(write, tmp_path):
     photos(tmp_path / "images", numbered("{}.png")[2:])
@@ -168,8 +173,7 @@ def test_a_conversion_names_missing_photos_and_fails_without_any(write, tmp_path
     assert not (tmp_path / "out 2.json").exists()
 
 
-def test_ten_thousand_names_are_looked_up_in_linear_time(tmp_path, monkeypatch):
-    """The folder is listed once, and at most as many headers are read as are measured."""
+def test_a_folder_is_listed_once_for_all_names(tmp_path, monkeypatch):
     names = [f"{index}.png" for index in range(2000)]
     (tmp_path / "images").mkdir()
     for name in names:

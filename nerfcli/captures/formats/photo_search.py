@@ -119,10 +119,13 @@ def places_of(
     names: Sequence[Name], homes: Sequence[Path], folders: Sequence[str], others: Sequence[str], *, is_given: bool
 ) -> list[Place]:
     """Return the folders that exist: those of the usual names in each home, the home, then those of other names."""
-    in_names = None if is_given else frozenset(part for name in names for part in name.folders)
+    # Of absolute paths only the last folders: the first, such as home, are not those of a capture.
+    in_names = None if is_given else frozenset(part for name in names for part in name.folders[-2:])
     usual, further = [], []
     for home in dict.fromkeys(homes):
-        inside = os.listdir(home) if home.is_dir() and os.access(home, os.R_OK | os.X_OK) else []
+        if not home.is_dir():
+            continue
+        inside = os.listdir(home) if os.access(home, os.R_OK | os.X_OK) else []
         usual += [Place(home / name, home, True) for name in _in_order(inside, folders) if (home / name).is_dir()]
         usual.append(Place(home, home, True, in_names))
         unusual = [name for name in others if name not in folders]
@@ -154,7 +157,7 @@ def search_of(place: Place, names: Sequence[Name], sizes: Sequence[Size | None] 
         for index, name in enumerate(names):
             if paths[index] is not None:
                 continue
-            score, best = _matches(name, photos, place)
+            score, best = _matches(name, photos, place, has_exact=exact > 0)
             candidates = [path for path in best if path not in taken]
             if len(candidates) > 1 and sizes is not None:
                 candidates = [path for path in candidates if _fit(path, sizes[index]).has_shape]
@@ -195,7 +198,9 @@ def search_of(place: Place, names: Sequence[Name], sizes: Sequence[Size | None] 
     return Search(place, paths, problems, unfit, (has_shape, len(found), not place.is_reduced, has_size, exact))
 
 
-def _matches(name: Name, photos: dict[str, list[tuple[str, ...]]], place: Place) -> tuple[tuple[int, ...], list[Path]]:
+def _matches(
+    name: Name, photos: dict[str, list[tuple[str, ...]]], place: Place, *, has_exact: bool
+) -> tuple[tuple[int, ...], list[Path]]:
     """Return the best score of photos for a name, and the photos that have it."""
     scored: dict[tuple[int, ...], list[Path]] = {}
     stem = next((stem for stem in name.stems if stem in photos), None)
@@ -205,7 +210,8 @@ def _matches(name: Name, photos: dict[str, list[tuple[str, ...]]], place: Place)
         while common < min(len(folders), len(name.folders)) and folders[-1 - common] == name.folders[-1 - common]:
             common += 1
         left = name.folders[: len(name.folders) - common]
-        if not name.is_absolute and len(folders) > common and not all(map(_is_image_folder, left)):
+        # A folder that the name lacks may be that of rejected photos, where others lie as they are listed.
+        if not name.is_absolute and len(folders) > common and (has_exact or not all(map(_is_image_folder, left))):
             continue
         path = place.path.joinpath(*parts)
         suffix = path.suffix.lower()
