@@ -9,6 +9,8 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
+from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 
@@ -68,6 +70,35 @@ def read_json_object(path: Path) -> dict[str, Any]:
         UserError: the file cannot be read, is not JSON, or does not hold an object.
     """
     return record_of(read_json(path, "expected a JSON file"), str(path))
+
+
+def read_xml(path: Path, expected: str) -> ElementTree.Element:
+    """Read the root of an XML file; tags and attributes keep their prefixes.
+
+    Raises:
+        UserError: the file cannot be read, is not XML, or declares a document type, so that it may have entities to
+            expand; `expected` says what it should have been.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise malformed(str(path), error.strerror or str(error), expected) from error
+
+    def refuse(*_: object) -> NoReturn:
+        raise malformed(str(path), "declares a document type (DOCTYPE)", expected)
+
+    builder = ElementTree.TreeBuilder()
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartDoctypeDeclHandler = refuse
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
+    try:
+        parser.Parse(data, True)
+    except (expat.ExpatError, ValueError, LookupError) as error:  # the latter two: an encoding that Python lacks
+        raise malformed(str(path), f"not valid XML: {error}", expected) from error
+    return builder.close()
 
 
 def content_lines(text: str) -> list[tuple[int, str]]:

@@ -16,9 +16,7 @@ from collections import Counter
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import NoReturn
 from xml.etree import ElementTree
-from xml.parsers import expat
 
 import numpy as np
 
@@ -26,7 +24,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, numbers, shown, size_of
+from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, numbers, read_xml, shown, size_of
 from nerfcli.captures.formats.format import Format, by_suffix
 from nerfcli.captures.formats.lens_fits import Fits, Terms
 from nerfcli.captures.formats.lenses import spherical_camera
@@ -120,35 +118,11 @@ def _matrix(record: Element, where: str) -> np.ndarray:
 
 def _chunk(path: Path) -> Element:
     """Return the first chunk: the root's child in an exported file, the root itself in the file of a project."""
-    root = _parse_xml(path)
+    root = read_xml(path, _EXPECTED)
     chunk = root if root.tag == "chunk" else root.find("chunk")
     if chunk is None:
         raise malformed(str(path), f"has no chunk element, but a {shown(root.tag)}", _EXPECTED)
     return chunk
-
-
-def _parse_xml(path: Path) -> Element:
-    """Read the root of an XML file; refuse a document type declaration, so that there are no entities to expand."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise malformed(str(path), error.strerror or str(error), _EXPECTED) from error
-
-    def refuse(*_: object) -> NoReturn:
-        raise malformed(str(path), "declares a document type (DOCTYPE)", _EXPECTED)
-
-    builder = ElementTree.TreeBuilder()
-    parser = expat.ParserCreate()
-    parser.buffer_text = True
-    parser.StartDoctypeDeclHandler = refuse
-    parser.StartElementHandler = builder.start
-    parser.EndElementHandler = builder.end
-    parser.CharacterDataHandler = builder.data
-    try:
-        parser.Parse(data, True)
-    except (expat.ExpatError, ValueError, LookupError) as error:  # the latter two: an encoding that Python lacks
-        raise malformed(str(path), f"not valid XML: {error}", _EXPECTED) from error
-    return builder.close()
 
 
 def _is_enabled(record: Element) -> bool:

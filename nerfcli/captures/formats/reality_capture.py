@@ -13,6 +13,7 @@ nerfstudio process_data/realitycapture_utils.py for the rotation (it takes t1 fo
 """
 
 import csv
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +69,7 @@ def parse_reality_capture(path: Path, measure: Measure, *, images: Path | None =
     for index, (name, image) in enumerate(zip(found.names, found.paths, strict=True)):
         if image is not None:
             intrinsics: dict[str, float] = dict(zip(_NUMBERS[6:], rows[index, 6:].tolist(), strict=True))
-            camera = _camera(intrinsics, stored_size(image, measure), places[index], fits)
+            camera = camera_of_values(intrinsics, stored_size(image, measure), places[index], fits)
             frames.append(Frame(name, camera, poses[index], image=image))
     notes = (*found.notes, *lost, *fits.notes())
     return Capture(tuple(frames), np.zeros((0, 3)), found.missing, kind="reality_capture", notes=notes)
@@ -123,12 +124,25 @@ def _cells(line: str, where: str) -> list[str]:
         raise malformed(where, f"is not a valid line of a table ({error})", _EXPECTED) from error
 
 
-def _camera(value: dict[str, float], size: tuple[int, int], where: str, fits: Fits) -> Camera:
+def camera_of_values(value: Mapping[str, float], size: tuple[int, int], where: str, fits: Fits) -> Camera:
+    """Return the camera of a photo with these intrinsics, as in the columns of the table.
+
+    Args:
+        value: f in mm on a frame 36 mm long, px, py, k1, ..., k4, t1 and t2; where the file has them, skew as a
+            fraction of the longer side, and aspect, fy over fx.
+
+    Raises:
+        UserError: no lens here fits the terms, or a number is invalid; `where` is named.
+    """
     scale = max(size)
-    focal = (value["f"] / 36 * scale,) * 2
+    focal = value["f"] / 36 * scale
     centre = (size[0] / 2 + value["px"] * scale, size[1] / 2 + value["py"] * scale)
-    terms = Terms((value["k1"], value["k2"], value["k3"], value["k4"]), (value["t2"], value["t1"]))
-    return fits.brown(size, focal, centre, terms=terms, where=where)
+    terms = Terms(
+        radial=(value["k1"], value["k2"], value["k3"], value["k4"]),
+        tangential=(value["t2"], value["t1"]),
+        skew=value.get("skew", 0.0) * scale,
+    )
+    return fits.brown(size, (focal, focal * value.get("aspect", 1.0)), centre, terms=terms, where=where)
 
 
 def find_reality_capture(path: Path) -> Path | None:
