@@ -5,16 +5,18 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli.captures import detect
+from nerfcli.captures.archives import unpacked
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.conversion import TOLERANCE_PX, ConventionOverrides, Conversion, TargetOptions, convert, load
 from nerfcli.captures.formats.format import Format, UserInputs
-from nerfcli.captures.formats.registry import recording
+from nerfcli.captures.formats.registry import recognise, recording
 from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.captures.stored_pixels import STORED, in_pixels, other_sizes
 from nerfcli.captures.world_frame import WorldFrame, in_world_frame
 from nerfcli.errors import UserError, listed, several
 from nerfcli.notices import Reporter
 from nerfcli.photos.images import HEIC_SUFFIXES
+from nerfcli.poses.input.video_frames import extract_frames, frames_folder
 
 
 def convert_capture(
@@ -38,6 +40,9 @@ def convert_capture(
         UserError: the capture cannot be read or written, the format cannot hold it, or what was written differs.
     """
     to = wanted.form.name
+    with reporter.stage(f"unpack {source.name}") as told:
+        source = unpacked(source, target, overwrite=wanted.overwrite, notify=told.note, progress=told.progress)
+    given = _with_frames(source, target, given, overwrite=wanted.overwrite, reporter=reporter)
     form, found, capture = load(source, given, overrides)
     reporter.note(f"{found}: {form.name}, {contents(capture)}")
     for text in capture.notes:
@@ -71,6 +76,18 @@ def convert_capture(
     if done.loss_px > TOLERANCE_PX:
         reporter.warn(f"dropping lens parameters shifts pixels by up to {done.loss_px:.3g} px")
     return done, _record(done, to) | frame
+
+
+def _with_frames(source: Path, target: Path, given: UserInputs, *, overwrite: bool, reporter: Reporter) -> UserInputs:
+    """Return the user's inputs, with the frames of a capture's video, written beside the target if it has no photos."""
+    form, found = recognise(source)
+    video = None if given.images is not None else form.video(found)
+    if video is None or any(frame.has_photo for frame in form.parse(found, given).frames):
+        return given
+    folder = frames_folder(target.with_suffix("") if target.suffix else target)
+    with reporter.stage(f"extract frames of {video.name}") as told:
+        extract_frames(video, folder, count=None, overwrite=overwrite, notify=told.note, progress=told.progress)
+    return replace(given, images=folder)
 
 
 def _report_missing(capture: Capture, reporter: Reporter) -> None:

@@ -51,6 +51,7 @@ class Format:
         unused_splits: splits whose photos are neither for training nor for evaluation.
         listed_by: the order of frames in its files, as a key to sort by; by default, that of the capture.
         write, losses: None for formats that are only read.
+        video: returns the video whose frames are the photos of what `find` found; None where the photos are files.
     """
 
     name: str
@@ -70,6 +71,7 @@ class Format:
     listed_by: Callable[[Frame], Any] = lambda frame: 0
     write: Callable[[Capture, Path], None] | None = None
     losses: Callable[[Capture], tuple[str, ...]] | None = None
+    video: Callable[[Path], Path | None] = lambda path: None
 
 
 def named(*names: str) -> Callable[[Path], Path | None]:

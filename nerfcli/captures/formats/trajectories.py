@@ -101,16 +101,36 @@ def _parse(
             f"{path}: a {kind.upper()} trajectory contains poses but no camera",
             GIVE_CAMERA,
         )
-    poses, frames = FramePoses(), []
+    poses, notes = _poses(path, pose_of, expected=expected)
+    check_unique_names((name for name, _ in poses), path)
+    frames = tuple(Frame(name, camera, world_from_cam) for name, world_from_cam in poses)
+    return Capture(frames, np.zeros((0, 3)), kind=kind, notes=notes)
+
+
+def tum_poses(path: Path) -> tuple[list[tuple[str, np.ndarray]], tuple[str, ...]]:
+    """Read the timestamps and poses `world_from_cam` of a trajectory in the TUM format, and notes of what was left out.
+
+    Raises:
+        UserError: the file is damaged; file and line are named.
+    """
+    return _poses(path, _tum_pose, expected=_TUM_EXPECTED)
+
+
+def _poses(
+    path: Path,
+    pose_of: Callable[[FramePoses, int, list[str], str], tuple[str, np.ndarray | None]],
+    *,
+    expected: str,
+) -> tuple[list[tuple[str, np.ndarray]], tuple[str, ...]]:
+    read, poses = FramePoses(), []
     for index, (number, line) in enumerate(content_lines(read_text(path, expected))):
-        name, world_from_cam = pose_of(poses, index, line.split(), f"{path}: line {number}")
+        name, world_from_cam = pose_of(read, index, line.split(), f"{path}: line {number}")
         if world_from_cam is not None:
-            frames.append(Frame(name, camera, world_from_cam))
-    notes = poses.notes()
-    if not frames:
+            poses.append((name, world_from_cam))
+    notes = read.notes()
+    if not poses:
         raise malformed(str(path), "has no pose", expected)
-    check_unique_names((frame.name for frame in frames), path)
-    return Capture(tuple(frames), np.zeros((0, 3)), kind=kind, notes=notes)
+    return poses, notes
 
 
 def _tum_pose(poses: FramePoses, _: int, words: list[str], where: str) -> tuple[str, np.ndarray | None]:

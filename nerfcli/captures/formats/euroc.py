@@ -1,0 +1,158 @@
+"""Sequences of the EuRoC MAV dataset, in the layout that its authors call ASL, read only: mav0/ with cam0, cam1, ...
+
+mav0/cam0/data.csv is a table of times in nanoseconds and files in mav0/cam0/data; mav0/cam0/sensor.yaml has T_BS,
+body_from_cam row by row with OpenCV axes, resolution, intrinsics fu, fv, cu, cv and distortion in OpenCV's order.
+mav0/state_groundtruth_estimate0/data.csv: time, position and quaternion w, x, y, z of world_from_body, in metres, the
+world's z axis up. Kalibr counts pixels from the centre of the first one; the numbers are kept as they are.
+Source: Burri et al. 2016, The EuRoC micro aerial vehicle datasets, section 5; ethz-asl/kalibr wiki, "Yaml formats".
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats import lenses
+from nerfcli.captures.formats.fields import content_lines, malformed, name_of, numbers, read_text, shown, size_of
+from nerfcli.captures.formats.format import Format
+from nerfcli.captures.formats.limits import quaternion_pose, rigid_pose
+from nerfcli.captures.formats.photo_names import find_photos
+from nerfcli.captures.formats.timed_poses import poses_at
+from nerfcli.errors import listed, several
+
+HOME, TRUTH = "mav0", "state_groundtruth_estimate0"
+_TRUTHS = (TRUTH, "mocap0", "vicon0")
+_BROWN = ("radial-tangential", "radtan", "plumb_bob", "none")
+_FISHEYE = ("equidistant", "equi")
+_EXPECTED = "expected a file of a EuRoC sequence"
+
+
+def parse_euroc(home: Path, *, images: Path | None = None) -> Capture:
+    """Read the photos of all cameras whose time is within that of the poses; poses are interpolated to it.
+
+    Args:
+        home: the folder mav0.
+        images: a folder of the photos, in which their paths or names are looked for instead.
+
+    Raises:
+        UserError: a file is damaged (file and line are named), or no photo has a pose.
+    """
+    truth = next(path for name in _TRUTHS if (path := home / name / "data.csv").is_file())
+    times, bodies = _bodies(truth)
+    names, seconds, views, cameras = [], [], [], {}
+    for folder in sorted(path.parent for path in home.glob("cam*/data.csv")):
+        cameras[folder.name] = _sensor(folder / "sensor.yaml")
+        for time, file in _pictures(folder / "data.csv"):
+            names.append(f"{folder.name}/data/{file}")
+            seconds.append((time - times[0]) / 1e9)
+            views.append(folder.name)
+    body_seconds = np.array([(time - times[0]) / 1e9 for time in times])
+    world_from_body, is_known = poses_at(body_seconds, bodies, np.array(seconds))
+    kept, unposed = np.flatnonzero(is_known), [names[index] for index in np.flatnonzero(~is_known)]
+    if not len(kept):
+        raise malformed(str(truth), "has no pose at the time of a photo", "copy the whole sequence")
+    names = [names[index] for index in kept]
+    sizes = [cameras[views[index]][0].size for index in kept]
+    found = find_photos(names, [home], given=images, sizes=sizes)
+    frames = []
+    for index, name, image in zip(kept, found.names, found.paths, strict=True):
+        camera, body_from_cam = cameras[views[index]]
+        place = image or (images or home) / name
+        frames.append(Frame(name, camera, world_from_body[index] @ body_from_cam, image=place))
+    notes = found.notes
+    if unposed:
+        notes += (f"{several(len(unposed), 'photo')} left out, as no pose is near in time: {listed(unposed)}",)
+    source = f"motion capture ({truth.parent.name})"
+    points = np.zeros((0, 3))
+    return Capture(tuple(frames), points, (), None, "euroc", unit="metre", unit_source=source, notes=notes)
+
+
+def _bodies(path: Path) -> tuple[list[int], np.ndarray]:
+    """Return the times in nanoseconds and the poses world_from_body (N, 4, 4)."""
+    times, poses = [], []
+    for line_number, line in content_lines(read_text(path, _EXPECTED)):
+        where, words = f"{path}: line {line_number}", line.split(",")
+        x, y, z, qw, *vector = numbers(words[1:8], 7, where)
+        times.append(_nanoseconds(words[0], where))
+        poses.append(quaternion_pose(np.array([*vector, qw]), np.array([x, y, z]), where))
+    if not times:
+        raise malformed(str(path), "has no pose", _EXPECTED)
+    return times, np.stack(poses)
+
+
+def _pictures(path: Path) -> list[tuple[int, str]]:
+    rows = []
+    for line_number, line in content_lines(read_text(path, _EXPECTED)):
+        time, _, file = line.partition(",")
+        where = f"{path}: line {line_number}"
+        rows.append((_nanoseconds(time, where), name_of(file, where)))
+    return rows
+
+
+def _nanoseconds(word: str, where: str) -> int:
+    text = word.strip()
+    if not re.fullmatch(r"\d{1,20}", text, re.ASCII):
+        raise malformed(where, f"its time is {shown(text)}", "expected nanoseconds")
+    return int(text)
+
+
+def _sensor(path: Path) -> tuple[Camera, np.ndarray]:
+    """Return the camera and body_from_cam of a sensor.yaml."""
+    where = str(path)
+    text = "\n".join(line.partition("#")[0] for line in read_text(path, _EXPECTED).splitlines())
+    words = _words(text, r"T_BS\s*:[^\]]*?\bdata", f"{where}: T_BS")
+    body_from_cam = rigid_pose(np.array(numbers(words, 16, f"{where}: T_BS")).reshape(4, 4), f"{where}: T_BS")
+    size = size_of(*_numbers(text, "resolution", 2, where), where)
+    fx, fy, cx, cy = _numbers(text, "intrinsics", 4, where)
+    model = _word(text, "camera_model", "pinhole")
+    kind = _word(text, "distortion_model", "none")
+    terms = _words(text, r"^\s*distortion_coeff\w*", f"{where}: distortion_coefficients") if kind != "none" else []
+    values = numbers(terms, len(terms), f"{where}: distortion_coefficients")
+    if model != "pinhole" or kind not in (*_BROWN, *_FISHEYE) or len(values) not in ((0, 4, 5), (4,))[kind in _FISHEYE]:
+        what = f"camera_model is {shown(model)}, distortion_model {shown(kind)} with {several(len(values), 'term')}"
+        raise malformed(where, what, "expected pinhole with radial-tangential (k1, k2, p1, p2) or equidistant")
+    if kind in _FISHEYE:
+        radial = (values[0], values[1], values[2], values[3])
+        return lenses.fisheye_camera(size, (fx, fy), (cx, cy), radial=radial, where=where), body_from_cam
+    k1, k2, p1, p2, k3 = values + [0.0] * (5 - len(values))
+    lens = lenses.brown_camera(size, (fx, fy), (cx, cy), radial=(k1, k2, k3), tangential=(p1, p2), where=where)
+    return lens, body_from_cam
+
+
+def _words(text: str, before: str, where: str) -> list[str]:
+    """Return the entries of the list in brackets after a key, which is a pattern."""
+    found = re.search(rf"{before}\s*:\s*\[([^\]]*)\]", text, re.MULTILINE)
+    if found is None:
+        raise malformed(where, "is missing", "expected a list of numbers in brackets")
+    return [word for word in re.split(r"[,\s]+", found[1]) if word]
+
+
+def _numbers(text: str, key: str, count: int, where: str) -> Sequence[float]:
+    return numbers(_words(text, rf"^\s*{key}", f"{where}: {key}"), count, f"{where}: {key}")
+
+
+def _word(text: str, key: str, default: str) -> str:
+    found = re.search(rf"^\s*{key}\s*:\s*[\"']?([\w-]+)", text, re.MULTILINE)
+    return found[1].lower() if found else default
+
+
+def find_euroc(path: Path) -> Path | None:
+    """Find the folder mav0 of a sequence, given the sequence, mav0 itself or a sensor.yaml in it."""
+    folder = path.parent.parent if path.is_file() and path.name == "sensor.yaml" else path
+    home = folder / HOME if (folder / HOME).is_dir() else folder
+    has_poses = any((home / name / "data.csv").is_file() for name in _TRUTHS)
+    return home if has_poses and any(home.glob("cam*/sensor.yaml")) else None
+
+
+FORMAT = Format(
+    "euroc",
+    "a sequence of EuRoC MAV",
+    "mav0/",
+    find_euroc,
+    lambda path, given: parse_euroc(path, images=given.images),
+    open_centre=True,
+)

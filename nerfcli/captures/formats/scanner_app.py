@@ -1,0 +1,84 @@
+"""Captures of 3D Scanner App (share "All Data"), read only: frame_00012.json beside frame_00012.jpg.
+
+cameraPoseARFrame is world_from_cam, 16 numbers row by row, with OpenGL axes as in ARKit, in metres, the world's y axis
+up; intrinsics are the matrix, 9 numbers row by row, for the size of the photo. The app writes a pose for every frame,
+but a photo for some of them only.
+depth_00012.png (16 bits, millimetres, 256x192) and conf_00012.png (0, 1, 2: ARConfidenceLevel) are of the same view.
+Source: pwais/psegs, "3DScannerApp Data Parsing"; laanlabs/ARBodyPoseRecorder, by the developer of the app.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.cameras.conventions import opencv_from_opengl_pose
+from nerfcli.cameras.frame import Frame
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.fields import malformed, read_json_object, vector
+from nerfcli.captures.formats.format import Format, has_keys
+from nerfcli.captures.formats.lenses import camera_of_matrix
+from nerfcli.captures.formats.limits import rigid_pose
+from nerfcli.captures.formats.photo_names import find_photos
+from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.captures.stored_pixels import measure
+
+_POSE = "cameraPoseARFrame"
+_FRAME = re.compile(r"frame_\d+\.json", re.IGNORECASE | re.ASCII)
+
+
+def frame_files(folder: Path) -> list[Path]:
+    """Return the JSON files of frames in a folder, in their order."""
+    files = (path for path in folder.iterdir() if _FRAME.fullmatch(path.name)) if folder.is_dir() else ()
+    return sorted(files, key=lambda path: (len(path.name), path.name))
+
+
+def parse_scanner_app(folder: Path, measure: Measure, *, images: Path | None = None) -> Capture:
+    """Read the frames that have a photo; the unit is the metre, by ARKit.
+
+    Args:
+        images: the folder of the photos; by default that of the files.
+
+    Raises:
+        UserError: a file is damaged (file and field are named), or no photo is on disk.
+    """
+    files = frame_files(folder)
+    found = find_photos([path.stem for path in files], [folder], given=images)
+    found = found.required(str(folder), "they give the sizes of the pictures")
+    frames, without = [], 0
+    for path, name, image in zip(files, found.names, found.paths, strict=True):
+        if image is None:
+            without += 1
+            continue
+        where, record = str(path), read_json_object(path)
+        matrix = vector(record, "intrinsics", 9, where).reshape(3, 3)
+        pose = vector(record, _POSE, 16, where).reshape(4, 4)
+        if pose[3].tolist() != [0, 0, 0, 1]:
+            raise malformed(where, f"{_POSE} is not a pose row by row", "expected a last row 0, 0, 0, 1")
+        camera = camera_of_matrix(matrix, stored_size(image, measure), f"{where}: intrinsics")
+        world_from_cam = opencv_from_opengl_pose(rigid_pose(pose, f"{where}: {_POSE}"))
+        frames.append(Frame(name, camera, world_from_cam, image=image))
+    notes = found.notes
+    if without:
+        notes += (f"{len(frames)} of the {len(files)} frames with a pose have a photo",)
+    source = "ARKit (3D Scanner App)"
+    return Capture(
+        tuple(frames), np.zeros((0, 3)), (), None, "3d-scanner-app", unit="metre", unit_source=source, notes=notes
+    )
+
+
+def find_scanner_app(path: Path) -> Path | None:
+    """Find the folder of a capture, given it or the file of a frame."""
+    files = [path] if path.is_file() and _FRAME.fullmatch(path.name) else frame_files(path)
+    is_frame = files and has_keys(files[0], f'"{_POSE}"'.encode(), lambda content: "intrinsics" in content)
+    return files[0].parent if is_frame else None
+
+
+FORMAT = Format(
+    "3d-scanner-app",
+    "3D Scanner App",
+    "frame_00000.json",
+    find_scanner_app,
+    lambda path, given: parse_scanner_app(path, measure, images=given.images),
+    axes="opengl",
+)

@@ -1,0 +1,128 @@
+"""Captures of the app Stray Scanner: odometry.csv, camera_matrix.csv, and a video rgb.mp4, whose frames are the photos.
+
+A row of odometry.csv is the pose of the video's frame with that number, from 0: world_from_cam with OpenCV axes (the
+app turns ARKit's cameras), in metres, the world's y axis up. camera_matrix.csv is the matrix of intrinsics for the size
+of the video, at its end; some recorders give fx, fy, cx and cy in each row. Photos are the frames as `nerfcli convert`
+and `nerfcli poses` take them from the video, frame_000123.jpg, or 000123.jpg. Read only.
+depth/000123.png (16 bits, millimetres, 0 is unknown) and confidence/000123.png (0, 1, 2) are of the same view, 256x192.
+Source: StrayRobots/scanner docs/format.md, StrayScanner/Helpers/OdometryEncoder.swift and DatasetEncoder.swift.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.cameras.frame import Frame, Size
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text
+from nerfcli.captures.formats.format import Format
+from nerfcli.captures.formats.lenses import camera_of_matrix
+from nerfcli.captures.formats.limits import quaternion_pose
+from nerfcli.captures.formats.photo_names import FoundPhotos, find_photos
+from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.captures.stored_pixels import measure
+from nerfcli.errors import several
+from nerfcli.photos.video import open_video
+
+ODOMETRY, MATRIX = "odometry.csv", "camera_matrix.csv"
+
+_FOLDERS = ("rgb", "images", "frames")
+_VIDEOS = tuple(f"rgb.{suffix}" for suffix in ("mp4", "mov", "mkv", "m4v"))
+_POSE = ("qx", "qy", "qz", "qw", "x", "y", "z")
+_LENS = ("fx", "fy", "cx", "cy")
+_EXPECTED = "expected the table of Stray Scanner: timestamp, frame, x, y, z, qx, qy, qz, qw"
+
+
+def parse_stray_scanner(folder: Path, measure: Measure, *, images: Path | None = None) -> Capture:
+    """Read the frames whose photo is on disk, or all frames if none is; the unit is the metre, by ARKit.
+
+    Args:
+        images: the folder of the photos; by default rgb/, images/ or frames/ beside the files.
+
+    Raises:
+        UserError: a file is damaged (file and line are named), or there are neither photos nor the video.
+    """
+    path = folder / ODOMETRY
+    rows = _rows(path)
+    found = _photos(list(rows), folder, images)
+    there = [image for image in found.paths if image is not None]
+    size = stored_size(there[0], measure) if there else _size_of_video(folder)
+    where = str(folder / MATRIX)
+    lines = content_lines(read_text(folder / MATRIX, "expected 3 lines of 3 numbers")) if not _has_lens(rows) else []
+    matrix = np.array([numbers(line.split(","), 3, f"{where}: line {index}") for index, line in lines])
+    if len(lines) not in (0, 3):
+        raise malformed(where, f"has {several(len(lines), 'line')}", "expected a matrix: 3 lines of 3 numbers")
+    frames = []
+    for row, name, image in zip(rows.values(), found.names, found.paths, strict=True):
+        if image is None and there:
+            continue
+        own = {key: row[key] for key in _LENS if key in row}
+        if own:
+            matrix = np.array([[own["fx"], 0, own["cx"]], [0, own["fy"], own["cy"]], [0, 0, 1]])
+        pose = np.array([row[key] for key in _POSE])
+        world_from_cam = quaternion_pose(pose[:4], pose[4:], f"{path}: frame {int(row['frame'])}")
+        frames.append(Frame(name, camera_of_matrix(matrix, size, where), world_from_cam, image=image))
+    check_unique_names((frame.name for frame in frames), path)
+    notes = found.notes
+    if there and len(there) < len(rows):
+        notes += (f"{len(there)} of the {len(rows)} frames with a pose have a photo",)
+    source = "ARKit (Stray Scanner)"
+    capture = Capture(tuple(frames), np.zeros((0, 3)), (), None, "stray-scanner", unit="metre", unit_source=source)
+    return replace(capture, notes=notes)
+
+
+def _rows(path: Path) -> dict[int, dict[str, float]]:
+    """Return the numbers of each row by the names of their columns, by the number of the frame."""
+    lines = content_lines(read_text(path, _EXPECTED))
+    header = [word.strip().lower() for word in lines[0][1].split(",")] if lines else []
+    if missing := [key for key in ("frame", *_POSE) if key not in header]:
+        raise malformed(str(path), f"has no column {missing[0]}", _EXPECTED)
+    rows = {}
+    for line_number, line in lines[1:]:
+        values = numbers([word.strip() for word in line.split(",")], len(header), f"{path}: line {line_number}")
+        row = dict(zip(header, values, strict=True))
+        rows[int(row["frame"])] = row
+    return rows
+
+
+def _has_lens(rows: dict[int, dict[str, float]]) -> bool:
+    return all(key in row for row in rows.values() for key in _LENS)
+
+
+def _photos(numbers: list[int], folder: Path, images: Path | None) -> FoundPhotos:
+    """Return the photos of frames by their numbers, under the names that have photos."""
+    tried = [
+        find_photos([f"{prefix}{index:06d}" for index in numbers], [folder], given=images, folders=_FOLDERS)
+        for prefix in ("frame_", "")
+    ]
+    return next((found for found in tried if any(found.paths)), tried[0])
+
+
+def video_of(folder: Path) -> Path | None:
+    """Return the video whose frames are the photos of a capture; None if it is not there."""
+    return next((folder / name for name in _VIDEOS if (folder / name).is_file()), None)
+
+
+def _size_of_video(folder: Path) -> Size:
+    video = video_of(folder)
+    if video is None:
+        raise malformed(str(folder), f"has neither photos nor the video {_VIDEOS[0]}", "copy the whole capture")
+    opened = open_video(video)
+    return opened.width, opened.height
+
+
+def find_stray_scanner(path: Path) -> Path | None:
+    """Find the folder of a capture, given it or its odometry.csv."""
+    folder = path.parent if path.name.lower() == ODOMETRY else path
+    return folder if all((folder / name).is_file() for name in (ODOMETRY, MATRIX)) else None
+
+
+FORMAT = Format(
+    "stray-scanner",
+    "Stray Scanner",
+    ODOMETRY,
+    find_stray_scanner,
+    lambda path, given: parse_stray_scanner(path, measure, images=given.images),
+    video=video_of,
+)
