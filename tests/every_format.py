@@ -214,6 +214,146 @@ def write_bundler(views: Views, folder: Path) -> Path:
     return text(folder / "bundle.out", "\n".join(lines) + "\n")
 
 
+def write_realityscan_xmp(views: Views, folder: Path) -> Path:
+    """As RealityScan exports "XMP with poses": some values are attributes, others elements."""
+    (width, height), (fx, fy, cx, cy) = views.camera.size, views.camera.params
+    longer = max(width, height)
+    names = 'xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#" xcr:Version="3" xcr:Coordinates="absolute"'
+    lens = f'xcr:DistortionModel="brown3" xcr:FocalLength35mm="{fx * 36 / longer!r}" xcr:AspectRatio="{fy / fx!r}"'
+    centre = f'xcr:PrincipalPointU="{(cx - width / 2) / longer!r}" xcr:PrincipalPointV="{(cy - height / 2) / longer!r}"'
+    for index, pose in enumerate(views.poses):
+        views.put(index, folder / f"{index}.jpg")
+        text(
+            folder / f"{index}.xmp",
+            f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+            f"<rdf:Description {names} {lens} {centre}><xcr:Rotation>{numbers(pose[:3, :3].T)}</xcr:Rotation>"
+            f"<xcr:Position>{numbers(pose[:3, 3])}</xcr:Position>"
+            "<xcr:DistortionCoeficients>0 0 0 0 0 0</xcr:DistortionCoeficients>"
+            "</rdf:Description></rdf:RDF></x:xmpmeta>",
+        )
+    return folder / "0.xmp"
+
+
+def write_openmvg(views: Views, folder: Path) -> Path:
+    """A camera of OpenMVG has one focal length."""
+    (width, height), (f, _, cx, cy) = views.camera.size, views.camera.params
+    frames = views.frames(folder)
+    pinhole = {"width": width, "height": height, "focal_length": f, "principal_point": [cx, cy]}
+    shared = {"polymorphic_id": 2**31 + 1, "polymorphic_name": "pinhole", "ptr_wrapper": {"id": 2**31, "data": pinhole}}
+    listed = [
+        {"local_path": "", "filename": frame.name, "id_view": index, "id_intrinsic": 7, "id_pose": index}
+        for index, frame in enumerate(frames)
+    ]
+    wrapped = [{"polymorphic_id": 2**30, "ptr_wrapper": {"id": 2**31 + 1, "data": view}} for view in listed]
+    poses = [{"rotation": frame.world_from_cam[:3, :3].T.tolist(), "center": frame.centre.tolist()} for frame in frames]
+    content = {
+        "sfm_data_version": "0.3",
+        "root_path": "/home/somebody/images",
+        "views": [{"key": index, "value": view} for index, view in enumerate(wrapped)],
+        "intrinsics": [{"key": 7, "value": shared}],
+        "extrinsics": [{"key": index, "value": pose} for index, pose in enumerate(poses)],
+        "structure": [],
+    }
+    return text(folder / "sfm_data.json", json.dumps(content))
+
+
+def write_kapture(views: Views, folder: Path) -> Path:
+    head, home = "# kapture format: 1.1\n", folder / "sensors"
+    lens = ", ".join(map(repr, (*views.camera.size, *views.camera.params)))
+    text(home / "sensors.txt", f"{head}cam0, phone, camera, PINHOLE, {lens}\ngps0, , gnss, EPSG:4326\n")
+    records, rows = [], []
+    for index, pose in enumerate(rigid.inverse(views.poses)):
+        views.put(index, home / f"records_data/walk/{index}.jpg")
+        records.append(f"{index:04d}, cam0, walk/{index}.jpg")
+        quaternion = rigid.quaternion_from_rotation(pose[:3, :3])  # w first
+        rows.append(f"{index:04d}, cam0, " + ", ".join(map(repr, [*quaternion.tolist(), *pose[:3, 3].tolist()])))
+    text(home / "records_camera.txt", head + "\n".join(records) + "\n")
+    return text(home / "trajectories.txt", head + "\n".join(rows) + "\n")
+
+
+def quaternion_rows(poses: np.ndarray) -> np.ndarray:
+    """Return x, y, z, qx, qy, qz, qw of poses, (N, 7)."""
+    return np.concatenate([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()], axis=1)
+
+
+def write_stray_scanner(views: Views, folder: Path) -> Path:
+    rows = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
+    for index, row in enumerate(quaternion_rows(views.poses).tolist()):
+        views.put(index, folder / f"rgb/frame_{index:06d}.jpg")
+        rows.append(f"{100 + index / 60!r}, {index:06d}, " + ", ".join(map(repr, row)))
+    text(folder / "camera_matrix.csv", "\n".join(", ".join(map(repr, row)) for row in views.matrix.tolist()))
+    return text(folder / "odometry.csv", "\n".join(rows) + "\n")
+
+
+def write_scanner_app(views: Views, folder: Path) -> Path:
+    for index, pose in enumerate(views.poses):
+        views.put(index, folder / f"frame_{index:05d}.jpg")
+        matrix = pose.copy()
+        matrix[:3, :3] = pose[:3, :3] @ OPENGL
+        content = {"cameraPoseARFrame": matrix.ravel().tolist(), "intrinsics": views.matrix.ravel().tolist()}
+        text(folder / f"frame_{index:05d}.json", json.dumps(content | {"frame_index": index, "motionQuality": 1}))
+    return folder / "frame_00000.json"
+
+
+def write_euroc(views: Views, folder: Path) -> Path:
+    """The body is turned against the camera by a quarter about its z axis, and away from it."""
+    body_from_cam = np.array([[0.0, -1, 0, 0.1], [1, 0, 0, -0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]])
+    times = [10**18 + index for index in range(len(views.poses))]
+    for index, time in enumerate(times):
+        views.put(index, folder / f"mav0/cam0/data/{time}.png")
+    text(folder / "mav0/cam0/data.csv", "#timestamp [ns],filename\n" + "".join(f"{t},{t}.png\r\n" for t in times))
+    lens = ", ".join(map(repr, views.camera.params))
+    text(
+        folder / "mav0/cam0/sensor.yaml",
+        f"# camera\nsensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n  data: [{numbers(body_from_cam)}]\n"
+        f"rate_hz: 20\nresolution: [{views.camera.width}, {views.camera.height}]\ncamera_model: pinhole\n"
+        f"intrinsics: [{lens}] #fu, fv, cu, cv\ndistortion_model: radial-tangential\n"
+        "distortion_coefficients: [0.0, 0.0, 0.0, 0.0]\n",
+    )
+    rows = quaternion_rows(views.poses @ np.linalg.inv(body_from_cam))[:, [0, 1, 2, 6, 3, 4, 5]].tolist()
+    lines = [f"{time},{','.join(map(repr, row))},0,0,0" for time, row in zip(times, rows, strict=True)]
+    return text(folder / "mav0/state_groundtruth_estimate0/data.csv", "#timestamp\n" + "\n".join(lines) + "\n")
+
+
+def write_tum_rgbd(views: Views, folder: Path) -> Path:
+    for index in range(len(views.poses)):
+        views.put(index, folder / f"rgb/{index}.png")
+    times = [1305031100.25 + index / 30 for index in range(len(views.poses))]
+    text(folder / "rgb.txt", "# color images\n" + "".join(f"{t!r} rgb/{i}.png\n" for i, t in enumerate(times)))
+    text(folder / "calibration.txt", " ".join(map(repr, views.camera.params)) + "\n")
+    rows = quaternion_rows(views.poses)
+    lines = [f"{time!r} {numbers(row)}" for time, row in zip(times, rows, strict=True)]
+    return text(folder / "groundtruth.txt", "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines) + "\n")
+
+
+def write_nerfies(views: Views, folder: Path) -> Path:
+    fx, fy, cx, cy = views.camera.params
+    lens = {"focal_length": fx, "pixel_aspect_ratio": fy / fx, "principal_point": [cx, cy], "skew": 0.0}
+    lens |= {"radial_distortion": [0.0] * 3, "tangential_distortion": [0.0] * 2, "image_size": [*views.camera.size]}
+    for index, pose in enumerate(views.poses):
+        views.put(index, folder / f"rgb/1x/{index:06d}.png")
+        content = {"orientation": pose[:3, :3].T.tolist(), "position": pose[:3, 3].tolist(), **lens}
+        text(folder / f"camera/{index:06d}.json", json.dumps(content))
+    ids = [f"{index:06d}" for index in range(len(views.poses))]
+    text(folder / "dataset.json", json.dumps({"count": len(ids), "ids": ids, "train_ids": ids[1:], "val_ids": ids[:1]}))
+    return folder / "camera/000000.json"
+
+
+def write_scannetpp(views: Views, folder: Path) -> Path:
+    """The released photos are of a fisheye lens; here their distortion is zero, and the lens of a pinhole camera."""
+    (w, h), (fx, fy, cx, cy) = views.camera.size, views.camera.params
+    frames = []
+    for index, pose in enumerate(views.poses):
+        views.put(index, folder / f"dslr/resized_images/DSC{index:05d}.jpg")
+        matrix = pose.copy()
+        matrix[:3, :3] = pose[:3, :3] @ OPENGL
+        record = {"file_path": f"DSC{index:05d}.jpg", "mask_path": f"DSC{index:05d}.png", "is_bad": False}
+        frames.append(record | {"transform_matrix": matrix.tolist()})
+    content = {"w": w, "h": h, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "camera_model": "PINHOLE"}
+    content |= {"frames": frames[1:], "test_frames": frames[:1]}
+    return text(folder / "dslr/nerfstudio/transforms.json", json.dumps(content))
+
+
 # Writes the capture into a folder, and returns a file of it.
 Writer = Callable[[Views, Path], Path]
 WITH_PHOTOS: dict[str, Writer] = {
@@ -233,5 +373,14 @@ WITH_PHOTOS: dict[str, Writer] = {
     "neus": write_neus,
     "pose-files": write_scannet,
     "alicevision": write_alicevision,
+    "realityscan-xmp": write_realityscan_xmp,
+    "openmvg": write_openmvg,
+    "kapture": write_kapture,
+    "stray-scanner": write_stray_scanner,
+    "3d-scanner-app": write_scanner_app,
+    "euroc": write_euroc,
+    "tum-rgbd": write_tum_rgbd,
+    "nerfies": write_nerfies,
+    "scannetpp": write_scannetpp,
     "run": write_run,
 }

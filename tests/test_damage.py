@@ -178,7 +178,7 @@ def corrupted_archive(data: bytes, rng: np.random.Generator) -> bytes:
 
 DAMAGE: dict[str, Callable[[bytes, np.random.Generator], bytes]] = {
     **dict.fromkeys((".json", ".sfm"), corrupted_json),
-    **dict.fromkeys((".txt", ".out", ".csv", ".xml", ".xtekct", ".log", ".ang"), corrupted_text),
+    **dict.fromkeys((".txt", ".out", ".csv", ".xml", ".xmp", ".yaml", ".xtekct", ".log", ".ang"), corrupted_text),
     ".npz": corrupted_archive,
 }
 

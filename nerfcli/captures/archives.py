@@ -11,17 +11,17 @@ import stat
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from nerfcli.atomic import atomic_folder, write_json
 from nerfcli.captures.formats.fields import read_json_object
-from nerfcli.captures.formats.registry import photo_folder, recognised
+from nerfcli.captures.formats.registry import ARCHIVES, photo_folder, recognised
 from nerfcli.errors import UserError, several
+from nerfcli.notices import Progress, Reporter
 
-SUFFIXES = (".zip", ".r3d")
 # What is in the folder of an unpacked archive besides its files.
 ARCHIVE_FILE = "archive.json"
 
@@ -40,18 +40,15 @@ _DAMAGED = (
 
 def is_archive(path: Path) -> bool:
     """Return whether a path is a file with the suffix of such an archive."""
-    return path.suffix.lower() in SUFFIXES and path.is_file()
+    return path.suffix.lower() in ARCHIVES and path.is_file()
 
 
-def unpacked(
-    path: Path, beside: Path, *, overwrite: bool, notify: Callable[[str], None], progress: Callable[[float, str], None]
-) -> Path:
+def unpacked(path: Path, beside: Path, *, overwrite: bool, reporter: Reporter) -> Path:
     """Return the folder of a capture: that of an archive's files, unpacked unless they are there; else the path itself.
 
     Args:
         beside: the result that is made of the capture; the files go to NAME-unpacked in its folder, all or nothing.
         overwrite: replace files that were unpacked from another archive. Nothing else is ever replaced.
-        progress: receives (fraction done in 0...1, current step).
 
     Raises:
         UserError: the archive is damaged, encrypted, or not safe to unpack; or the folder contains something else.
@@ -59,14 +56,14 @@ def unpacked(
     if not is_archive(path):
         return path
     folder = beside.absolute().parent / f"{path.stem}-unpacked"
-    with _opened(path) as archive:
+    with _opened(path) as archive, reporter.stage(f"unpack {path.name}") as told:
         members = _checked(path, archive.infolist())
         content = {"archive": path.name, "bytes": path.stat().st_size, "files": _digest(members)}
         if not _is_kept(folder, content, path, overwrite=overwrite):
-            _extract(archive, members, folder, content, progress)
-            notify(f"{folder}: {several(len(members), 'file')} of {path.name}")
+            _extract(archive, members, folder, content, told.progress)
+            told.note(f"{folder}: {several(len(members), 'file')} of {path.name}")
         else:
-            notify(f"{folder} is kept: it has the files of {path.name}")
+            told.note(f"{folder} is kept: it has the files of {path.name}")
     return _innermost(folder)
 
 
@@ -143,7 +140,7 @@ def _extract(
     members: list[zipfile.ZipInfo],
     folder: Path,
     content: dict[str, Any],
-    progress: Callable[[float, str], None],
+    progress: Progress,
 ) -> None:
     total = sum(entry.file_size for entry in members)
     home = next(parent for parent in folder.parents if parent.exists())

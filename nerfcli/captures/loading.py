@@ -92,12 +92,14 @@ def with_photos_on_disk(path: Path, form: Format, found: Path, capture: Capture)
     order = [index for index in order if frames[index].split not in form.unused_splits]
     fitted = {index: _upright(capture, frames[index]) for index in order if frames[index].has_photo}
     if not fitted:
-        first = frames[order[0] if order else 0]
+        first, video = frames[order[0] if order else 0], form.video(found)
+        line = f"nerfcli convert {in_shell(path)} SCENE --to nerfcli"
         raise UserError(
             f"{found}: {form.name} ({form.of}), none of its {len(order)} photos is on disk, such as "
             f"{first.image or first.name}",
-            "put the photos where the capture lists them, or give their folder: "
-            f"nerfcli convert {in_shell(path)} SCENE --to nerfcli --images FOLDER",
+            f"put the photos where the capture lists them, or give their folder: {line} --images FOLDER"
+            if video is None
+            else f"they are frames of {video.name}; {line} writes them",
         )
     splits = {frames[index].split for index in (order if form.has_split else fitted)}
     if form.has_split or {"test", "val"} & splits:

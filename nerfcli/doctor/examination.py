@@ -10,7 +10,7 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.calibration import Calibration, Picture, calibrated
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.registry import recognised
+from nerfcli.captures.formats.registry import recognised, refuse_archive
 from nerfcli.captures.loading import load_scene
 from nerfcli.doctor import camera_layout, geometry, inventory, quality
 from nerfcli.doctor.compared_pairs import Pair, choose_pairs, compare, pair_count
@@ -75,6 +75,7 @@ def find_subject(path: Path, *, subfolders: bool = False) -> ExaminedCapture:
     """
     if not path.exists():
         raise UserError(f"{path} does not exist", "give a folder of photos, or a scene folder")
+    refuse_archive(path)
     if recognised(path) is not None:
         if subfolders:
             raise UserError(f"{path}: --subfolders is for photos, and this is a scene", "leave --subfolders out")

@@ -40,8 +40,7 @@ def convert_capture(
         UserError: the capture cannot be read or written, the format cannot hold it, or what was written differs.
     """
     to = wanted.form.name
-    with reporter.stage(f"unpack {source.name}") as told:
-        source = unpacked(source, target, overwrite=wanted.overwrite, notify=told.note, progress=told.progress)
+    source = unpacked(source, target, overwrite=wanted.overwrite, reporter=reporter)
     given = _with_frames(source, target, given, overwrite=wanted.overwrite, reporter=reporter)
     form, found, capture = load(source, given, overrides)
     reporter.note(f"{found}: {form.name}, {contents(capture)}")

@@ -14,7 +14,7 @@ from nerfcli.cameras.camera import by_lens
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import vector_from_rotation
 from nerfcli.captures.formats.format import UserInputs
-from nerfcli.captures.formats.registry import recognise, recognised
+from nerfcli.captures.formats.registry import recognise, recognised, refuse_archive
 from nerfcli.captures.formats.run_cameras import CAMERAS
 from nerfcli.captures.loading import describe_unused_masks, fingerprint, with_photos_on_disk
 from nerfcli.captures.orientation import describe_rescaling
@@ -43,6 +43,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         raise UserError(f"{folder} does not exist", "give a scene, a run, renders, or one of their files")
     if folder.name == RENDERS:
         folder = folder.parent
+    refuse_archive(folder)
     folder = _whole(folder)
     if folder.is_file() and folder.suffix == ".safetensors":
         return describe_tensors(folder)

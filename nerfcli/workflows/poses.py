@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
+from nerfcli.captures.archives import is_archive, unpacked
 from nerfcli.captures.calibration import Calibration, read_calibration
+from nerfcli.captures.formats.registry import photo_folder
 from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.errors import UserError, duration
 from nerfcli.machine import Resources
@@ -52,7 +54,8 @@ def estimate_poses(
         >>> len(nerfcli.load_scene(folder).train_frames)
 
     Args:
-        photos: a folder of photos, or a video, whose sharpest frames are first written beside the scene.
+        photos: a folder of photos or a zip archive of one, which is first unpacked beside the scene; or a video, whose
+            sharpest frames are first written beside the scene.
         output: the folder to write; PHOTOS-scene by default.
         settings: features, pairs, seed, threads; by default those of `nerfcli poses`.
         frames: number of frames to use from a video; None for 120.
@@ -70,7 +73,10 @@ def estimate_poses(
     source = Path(photos)
     target = output.beside(without_suffix(source), "-scene")
     folder = source
-    if source.is_file():
+    if is_archive(source):
+        files = unpacked(source, target, overwrite=output.overwrite, reporter=reporter)
+        folder = photo_folder(files) or files
+    elif source.is_file():
         folder = frames_folder(target)
         with reporter.stage(f"extract frames of {source.name}") as told:
             extract_frames(
@@ -165,7 +171,7 @@ def plan_scene(
 
 
 def without_suffix(source: Path) -> Path:
-    """Return the path that results are named after: clip for clip.mp4, the folder itself for a folder."""
+    """Return the path that results are named after: clip for clip.mp4 or clip.zip, the folder itself for a folder."""
     return source.with_suffix("") if source.is_file() else source
 
 
@@ -173,8 +179,11 @@ def folder_with_frames(source: Path, scene: Path) -> Path:
     """Return the folder of photos: `source` itself or, for a video, the folder with the frames extracted earlier.
 
     Raises:
-        UserError: the frames of a video have not been extracted.
+        UserError: the frames of a video have not been extracted, or it is an archive.
     """
+    if is_archive(source):
+        hint = "run it without --dry-run, or unpack it and give the folder"
+        raise UserError(f"--dry-run: {source} is an archive, and a dry run does not unpack it", hint)
     folder = frames_folder(scene) if source.is_file() else source
     if source.is_file() and not folder.exists():
         raise UserError(

@@ -8,6 +8,7 @@ from typing import Any
 
 from nerfcli import distributed
 from nerfcli.atomic import clear_leftovers, exclusive
+from nerfcli.captures.archives import unpacked
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.loading import (
     describe_source,
@@ -72,8 +73,9 @@ def train_scene(
         UserError: see `nerfcli.training.loop.train`; or a different run exists there.
         KeyboardInterrupt: passed on after a checkpoint has been written.
     """
-    folder = Path(scene)
-    run = output.beside(folder, "-run")
+    given = Path(scene)
+    run = output.beside(given, "-run")
+    folder = unpacked(given, run, overwrite=output.overwrite, reporter=reporter)
     loaded = load_scene(folder, holdout=holdout)
     _describe(folder, loaded, reporter)
     if resume and not Run(run).is_trained and not (run / STATE).exists():

@@ -141,8 +141,8 @@ def _word(text: str, key: str, default: str) -> str:
 
 
 def find_euroc(path: Path) -> Path | None:
-    """Find the folder mav0 of a sequence, given the sequence, mav0 itself or a sensor.yaml in it."""
-    folder = path.parent.parent if path.is_file() and path.name == "sensor.yaml" else path
+    """Find the folder mav0 of a sequence, given the sequence, mav0 itself or a file in it."""
+    folder = path.parent.parent if path.is_file() and path.name in ("data.csv", "sensor.yaml") else path
     home = folder / HOME if (folder / HOME).is_dir() else folder
     has_poses = any((home / name / "data.csv").is_file() for name in _TRUTHS)
     return home if has_poses and any(home.glob("cam*/sensor.yaml")) else None

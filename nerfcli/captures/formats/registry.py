@@ -47,26 +47,26 @@ from nerfcli.photos.masks import mask_of
 
 # The first format that is found in a folder counts, so those that hold more come first.
 FORMATS = (
+    nerfies.FORMAT,  # before that of scenes, as it has a scene.json of its own
     scene_folder.FORMAT,
     colmap.BINARY,
     colmap.TEXT,
     scannetpp.FORMAT,
     openmvg.FORMAT,
-    nerfies.FORMAT,
     scanner_app.FORMAT,
     transforms.FORMAT,
     blender.FORMAT,
     llff.FORMAT,
     opensfm.FORMAT,
     metashape.FORMAT,
+    stray_scanner.FORMAT,
+    euroc.FORMAT,
     reality_capture.FORMAT,
     realityscan_xmp.FORMAT,
     bundler.FORMAT,
     polycam.FORMAT,
     record3d.FORMAT,
-    stray_scanner.FORMAT,
     kapture.FORMAT,
-    euroc.FORMAT,
     tum_rgbd.FORMAT,
     mvsnet.FORMAT,
     neus.FORMAT,
@@ -78,6 +78,9 @@ FORMATS = (
     trajectories.KITTI,
     ply.FORMAT,
 )
+
+# Suffixes of archives, which are unpacked before they are read; .r3d is Record3D's.
+ARCHIVES = (".zip", ".r3d")
 
 
 def recognised(path: Path) -> tuple[Format, Path] | None:
@@ -95,6 +98,8 @@ def recognise(path: Path) -> tuple[Format, Path]:
         raise UserError(f"{path} does not exist", "give a capture: a file or folder of cameras, or a scene folder")
     if (found := recognised(path)) is not None:
         return found
+    if path.is_file() and path.suffix.lower() in ARCHIVES:
+        raise UserError(f"{path} is an archive", f"unpack it with: nerfcli convert {in_shell(path)} SCENE --to nerfcli")
     if photos := photo_folder(path):
         raise UserError(
             f"{photos} has {several(len(list_images(photos)), 'photo')} but no cameras",
@@ -102,6 +107,16 @@ def recognise(path: Path) -> tuple[Format, Path]:
         )
     looked_for = ", ".join(dict.fromkeys(form.looked_for for form in FORMATS if form.looked_for))
     raise UserError(f"{path} contains no capture in a supported format", f"looked for {looked_for}")
+
+
+def refuse_archive(path: Path) -> None:
+    """Refuse an archive where it cannot be unpacked, since no result is asked for.
+
+    Raises:
+        UserError: it is one.
+    """
+    if path.is_file() and path.suffix.lower() in ARCHIVES:
+        raise UserError(f"{path} is an archive", f"unpack it: nerfcli convert {in_shell(path)} SCENE --to nerfcli")
 
 
 def photo_folder(path: Path) -> Path | None:

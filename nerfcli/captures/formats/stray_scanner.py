@@ -19,7 +19,7 @@ from nerfcli.captures.formats.fields import check_unique_names, content_lines, m
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.lenses import camera_of_matrix
 from nerfcli.captures.formats.limits import quaternion_pose
-from nerfcli.captures.formats.photo_names import FoundPhotos, find_photos
+from nerfcli.captures.formats.photo_names import GIVE_PHOTOS, FoundPhotos, find_photos
 from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import several
@@ -107,7 +107,9 @@ def video_of(folder: Path) -> Path | None:
 def _size_of_video(folder: Path) -> Size:
     video = video_of(folder)
     if video is None:
-        raise malformed(str(folder), f"has neither photos nor the video {_VIDEOS[0]}", "copy the whole capture")
+        raise malformed(
+            str(folder), f"has neither photos nor the video {_VIDEOS[0]}", f"copy the whole capture; {GIVE_PHOTOS}"
+        )
     opened = open_video(video)
     return opened.width, opened.height
 
