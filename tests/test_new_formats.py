@@ -377,7 +377,8 @@ class TestEuroc:
             VIEWS.put(0, home / "cam1/data" / photo.name)
         capture = parse(tmp_path)
         assert [frame.name.split("/")[0] for frame in capture.frames] == ["cam0", "cam0", "cam1", "cam1"]
-        assert re.fullmatch(r"2 photos left out, as no pose is near in time: cam0/data/999\d+.png, .*", *capture.notes)
+        (note,) = capture.notes
+        assert re.fullmatch(r"2 photos left out, as no pose is near in time: cam0/data/999\d+.png, .*", note)
 
     def test_a_model_that_is_not_supported_is_named(self, tmp_path):
         home = WITH_PHOTOS["euroc"](VIEWS, tmp_path).parent.parent
@@ -423,7 +424,8 @@ class TestNerfies:
         np.save(tmp_path / "points.npy", np.array([[1, 2, 3]], np.float32))
         capture = parse(tmp_path)
         assert [frame.split for frame in capture.frames] == ["val", "train"]
-        np.testing.assert_allclose(capture.depth_bounds, [[0.2, 4], [0.2, 4]])
+        assert capture.depth_bounds is not None
+        np.testing.assert_allclose(capture.depth_bounds, [[0.2, 4], [0.2, 4]], rtol=1e-12)
         np.testing.assert_array_equal(capture.points, [[1, 2, 3]])
 
     def test_reduced_photos_only_and_a_photo_without_a_camera(self, tmp_path):

@@ -68,7 +68,7 @@ def parse_euroc(home: Path, *, images: Path | None = None) -> Capture:
         notes += (f"{several(len(unposed), 'photo')} left out, as no pose is near in time: {listed(unposed)}",)
     source = f"motion capture ({truth.parent.name})"
     points = np.zeros((0, 3))
-    return Capture(tuple(frames), points, (), None, "euroc", unit="metre", unit_source=source, notes=notes)
+    return Capture(tuple(frames), points, kind="euroc", unit="metre", unit_source=source, notes=notes)
 
 
 def _bodies(path: Path) -> tuple[list[int], np.ndarray]:
@@ -106,7 +106,8 @@ def _sensor(path: Path) -> tuple[Camera, np.ndarray]:
     text = "\n".join(line.partition("#")[0] for line in read_text(path, _EXPECTED).splitlines())
     words = _words(text, r"T_BS\s*:[^\]]*?\bdata", f"{where}: T_BS")
     body_from_cam = rigid_pose(np.array(numbers(words, 16, f"{where}: T_BS")).reshape(4, 4), f"{where}: T_BS")
-    size = size_of(*_numbers(text, "resolution", 2, where), where)
+    width, height = _numbers(text, "resolution", 2, where)
+    size = size_of(width, height, where)
     fx, fy, cx, cy = _numbers(text, "intrinsics", 4, where)
     model = _word(text, "camera_model", "pinhole")
     kind = _word(text, "distortion_model", "none")

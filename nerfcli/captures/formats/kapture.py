@@ -88,7 +88,7 @@ def parse_kapture(folder: Path, *, camera: Camera | None = None, images: Path | 
     if unposed:
         notes += (f"{several(len(unposed), 'photo')} without a pose left out: {listed(unposed)}",)
     points, colours = _points(folder / "reconstruction/points3d.txt")
-    return Capture(frames, points, (), None, "kapture", colours=colours, notes=notes)
+    return Capture(frames, points, kind="kapture", colours=colours, notes=notes)
 
 
 def _rows(path: Path, *, least: int) -> list[_Row]:

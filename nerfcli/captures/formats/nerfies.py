@@ -64,17 +64,17 @@ def parse_nerfies(folder: Path, *, images: Path | None = None) -> Capture:
     found = find_photos(names, homes, given=images, sizes=[camera.size for camera, _ in views])
     splits = {**dict.fromkeys(train, "train"), **dict.fromkeys(held_out, "val")} if held_out else {}
     frames = []
-    for name, (camera, record), full, image in zip(names, views, found.names, found.paths, strict=True):
+    for name, (camera, record), image in zip(names, views, found.paths, strict=True):
         pose = _pose(record, str(folder / CAMERAS / f"{name}.json"))
-        place = image or (images or homes[0]) / full
-        frames.append(Frame(full, camera, pose, image=place, split=splits.get(name)))
+        place = image or (images or homes[0]) / name
+        frames.append(Frame(place.name, camera, pose, image=place, split=splits.get(name)))
     if not frames:
         raise malformed(str(folder), f"has no file in {CAMERAS}/ of the photos in {DATASET}", "copy the whole capture")
     notes = found.notes
     if unposed:
         notes += (f"{several(len(unposed), 'photo')} without a camera left out: {listed(unposed)}",)
     bounds = _depth_bounds(folder / "scene.json", len(frames))
-    return Capture(tuple(frames), _points(folder / "points.npy"), (), bounds, "nerfies", notes=notes)
+    return Capture(tuple(frames), _points(folder / "points.npy"), depth_bounds=bounds, kind="nerfies", notes=notes)
 
 
 def _names(content: dict[str, Any], key: str, path: Path) -> list[str]:
@@ -85,7 +85,7 @@ def _names(content: dict[str, Any], key: str, path: Path) -> list[str]:
 
 
 def _camera(record: dict[str, Any], where: str) -> Camera:
-    size = vector(record, "image_size", 2, where).tolist()
+    width, height = vector(record, "image_size", 2, where).tolist()
     focal, skew = number(record, "focal_length", where), number(record, "skew", where, default=0.0)
     aspect = number(record, "pixel_aspect_ratio", where, default=1.0)
     if abs(skew) > 1e-6 * abs(focal):
@@ -94,7 +94,7 @@ def _camera(record: dict[str, Any], where: str) -> Camera:
     radial = _terms(record, ("radial_distortion",), 3, where)
     tangential = _terms(record, ("tangential", "tangential_distortion"), 2, where)
     return lenses.brown_camera(
-        size_of(*size, where),
+        size_of(width, height, where),
         (focal, focal * aspect),
         (x, y),
         radial=(radial[0], radial[1], radial[2]),

@@ -34,7 +34,7 @@ from nerfcli.captures.formats.fields import (
 )
 from nerfcli.captures.formats.format import Format, has_keys, named
 from nerfcli.captures.formats.limits import plausible, rigid_pose
-from nerfcli.captures.formats.photo_names import IMAGE_FOLDERS, find_photos
+from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.errors import listed, several
 
 FILES = ("sfm_data.json", *(f"reconstruction{name}/sfm_data.json" for name in ("", "_sequential", "_global")))
@@ -81,7 +81,6 @@ def parse_openmvg(path: Path, *, images: Path | None = None) -> Capture:
         [name for _, name, _, _ in views],
         [home for home in homes if home.is_dir()],
         given=images,
-        folders=IMAGE_FOLDERS,
         sizes=[camera.size for _, _, camera, _ in views],
     )
     frames = tuple(
@@ -92,7 +91,7 @@ def parse_openmvg(path: Path, *, images: Path | None = None) -> Capture:
     notes = found.notes
     if unposed:
         notes += (f"{several(len(unposed), 'photo')} without a pose left out: {listed(unposed)}",)
-    return Capture(frames, points, (), None, "openmvg", observations=observations, notes=notes)
+    return Capture(frames, points, kind="openmvg", observations=observations, notes=notes)
 
 
 def _entries(content: dict[str, Any], key: str, home: Path | str) -> Iterator[tuple[int, dict[str, Any], str]]:

@@ -59,15 +59,15 @@ def parse_realityscan_xmp(folder: Path, measure: Measure, *, images: Path | None
     found = find_photos([path.stem for path, _ in posed], [folder], given=images)
     found = found.required(str(folder), "they give the sizes of the pictures")
     frames = []
-    for (path, value), name, image in zip(posed, found.names, found.paths, strict=True):
+    for (path, value), image in zip(posed, found.paths, strict=True):
         if image is not None:
             camera = _camera(value, stored_size(image, measure), str(path))
-            frames.append(Frame(name, camera, _pose(value, str(path)), image=image))
+            frames.append(Frame(image.name, camera, _pose(value, str(path)), image=image))
     notes = list(found.notes)
     if without:
         names = listed([path.name for path, _ in without])
         notes.append(f"{several(len(without), 'XMP file')} without a pose in the scene left out: {names}")
-    return Capture(tuple(frames), np.zeros((0, 3)), found.missing, None, "realityscan-xmp", notes=tuple(notes))
+    return Capture(tuple(frames), np.zeros((0, 3)), found.missing, kind="realityscan-xmp", notes=tuple(notes))
 
 
 def _values(path: Path) -> dict[str, str]:

@@ -46,7 +46,7 @@ def parse_scanner_app(folder: Path, measure: Measure, *, images: Path | None = N
     found = find_photos([path.stem for path in files], [folder], given=images)
     found = found.required(str(folder), "they give the sizes of the pictures")
     frames, without = [], 0
-    for path, name, image in zip(files, found.names, found.paths, strict=True):
+    for path, image in zip(files, found.paths, strict=True):
         if image is None:
             without += 1
             continue
@@ -57,13 +57,13 @@ def parse_scanner_app(folder: Path, measure: Measure, *, images: Path | None = N
             raise malformed(where, f"{_POSE} is not a pose row by row", "expected a last row 0, 0, 0, 1")
         camera = camera_of_matrix(matrix, stored_size(image, measure), f"{where}: intrinsics")
         world_from_cam = opencv_from_opengl_pose(rigid_pose(pose, f"{where}: {_POSE}"))
-        frames.append(Frame(name, camera, world_from_cam, image=image))
+        frames.append(Frame(image.name, camera, world_from_cam, image=image))
     notes = found.notes
     if without:
         notes += (f"{len(frames)} of the {len(files)} frames with a pose have a photo",)
     source = "ARKit (3D Scanner App)"
     return Capture(
-        tuple(frames), np.zeros((0, 3)), (), None, "3d-scanner-app", unit="metre", unit_source=source, notes=notes
+        tuple(frames), np.zeros((0, 3)), kind="3d-scanner-app", unit="metre", unit_source=source, notes=notes
     )
 
 

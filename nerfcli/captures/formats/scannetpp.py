@@ -70,7 +70,7 @@ def parse_scannetpp(path: Path, *, images: Path | None = None) -> Capture:
     if bad:
         notes += (f"{several(bad, 'photo')} marked as bad left out",)
     points, source = np.zeros((0, 3)), "laser scan (ScanNet++)"
-    return Capture(tuple(frames), points, (), None, "scannetpp", unit="metre", unit_source=source, notes=notes)
+    return Capture(tuple(frames), points, kind="scannetpp", unit="metre", unit_source=source, notes=notes)
 
 
 def _records(content: dict[str, Any], key: str, path: Path) -> list[tuple[dict[str, Any], str]]:

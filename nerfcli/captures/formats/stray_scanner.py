@@ -8,7 +8,6 @@ depth/000123.png (16 bits, millimetres, 0 is unknown) and confidence/000123.png 
 Source: StrayRobots/scanner docs/format.md, StrayScanner/Helpers/OdometryEncoder.swift and DatasetEncoder.swift.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,28 +47,38 @@ def parse_stray_scanner(folder: Path, measure: Measure, *, images: Path | None =
     found = _photos(list(rows), folder, images)
     there = [image for image in found.paths if image is not None]
     size = stored_size(there[0], measure) if there else _size_of_video(folder)
-    where = str(folder / MATRIX)
-    lines = content_lines(read_text(folder / MATRIX, "expected 3 lines of 3 numbers")) if not _has_lens(rows) else []
-    matrix = np.array([numbers(line.split(","), 3, f"{where}: line {index}") for index, line in lines])
-    if len(lines) not in (0, 3):
-        raise malformed(where, f"has {several(len(lines), 'line')}", "expected a matrix: 3 lines of 3 numbers")
+    has_lenses = all(key in row for row in rows.values() for key in _LENS)
+    matrix = np.eye(3) if has_lenses else _matrix(folder / MATRIX)
     frames = []
     for row, name, image in zip(rows.values(), found.names, found.paths, strict=True):
         if image is None and there:
             continue
-        own = {key: row[key] for key in _LENS if key in row}
-        if own:
-            matrix = np.array([[own["fx"], 0, own["cx"]], [0, own["fy"], own["cy"]], [0, 0, 1]])
+        where = f"{path}: frame {int(row['frame'])}"
+        if has_lenses:
+            matrix = np.array([[row["fx"], 0, row["cx"]], [0, row["fy"], row["cy"]], [0, 0, 1]])
         pose = np.array([row[key] for key in _POSE])
-        world_from_cam = quaternion_pose(pose[:4], pose[4:], f"{path}: frame {int(row['frame'])}")
-        frames.append(Frame(name, camera_of_matrix(matrix, size, where), world_from_cam, image=image))
+        camera = camera_of_matrix(matrix, size, where if has_lenses else str(folder / MATRIX))
+        world_from_cam = quaternion_pose(pose[:4], pose[4:], where)
+        frames.append(Frame(name if image is None else image.name, camera, world_from_cam, image=image))
     check_unique_names((frame.name for frame in frames), path)
     notes = found.notes
     if there and len(there) < len(rows):
         notes += (f"{len(there)} of the {len(rows)} frames with a pose have a photo",)
-    source = "ARKit (Stray Scanner)"
-    capture = Capture(tuple(frames), np.zeros((0, 3)), (), None, "stray-scanner", unit="metre", unit_source=source)
-    return replace(capture, notes=notes)
+    return Capture(
+        tuple(frames),
+        np.zeros((0, 3)),
+        kind="stray-scanner",
+        unit="metre",
+        unit_source="ARKit (Stray Scanner)",
+        notes=notes,
+    )
+
+
+def _matrix(path: Path) -> np.ndarray:
+    lines = content_lines(read_text(path, "expected 3 lines of 3 numbers"))
+    if len(lines) != 3:
+        raise malformed(str(path), f"has {several(len(lines), 'line')}", "expected a matrix: 3 lines of 3 numbers")
+    return np.array([numbers(line.split(","), 3, f"{path}: line {index}") for index, line in lines])
 
 
 def _rows(path: Path) -> dict[int, dict[str, float]]:
@@ -84,10 +93,6 @@ def _rows(path: Path) -> dict[int, dict[str, float]]:
         row = dict(zip(header, values, strict=True))
         rows[int(row["frame"])] = row
     return rows
-
-
-def _has_lens(rows: dict[int, dict[str, float]]) -> bool:
-    return all(key in row for row in rows.values() for key in _LENS)
 
 
 def _photos(numbers: list[int], folder: Path, images: Path | None) -> FoundPhotos:

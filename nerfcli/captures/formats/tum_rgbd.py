@@ -76,7 +76,7 @@ def parse_tum_rgbd(
     if unposed:
         notes += (f"{several(len(unposed), 'photo')} left out, as no pose is near in time: {listed(unposed)}",)
     points, source = np.zeros((0, 3)), "motion capture (TUM RGB-D)"
-    return Capture(frames, points, (), None, "tum-rgbd", unit="metre", unit_source=source, notes=notes)
+    return Capture(frames, points, kind="tum-rgbd", unit="metre", unit_source=source, notes=notes)
 
 
 def _own_camera(folder: Path, size: tuple[int, int]) -> Camera:
