@@ -1,0 +1,211 @@
+"""Archives of captures: what is unpacked, where, and what is refused, since archives come from others."""
+
+import shutil
+import stat
+import zipfile
+from collections import namedtuple
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clips import encode
+from every_format import WITH_PHOTOS, Views
+from test_new_formats import PLACES, POSES
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.captures.archives import unpacked
+from nerfcli.captures.conversion import TargetOptions
+from nerfcli.captures.formats.registry import format_named, recognise
+from nerfcli.captures.loading import load_scene
+from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.notices import Reporter
+from nerfcli.photos.images import read_image
+from nerfcli.workflows.convert import convert_capture
+from nerfcli.workflows.describe import describe
+
+Disk = namedtuple("Disk", "free")
+VIEWS = Views(Camera.pinhole(64, 48, 70.0), POSES)
+
+
+def packed(folder: Path, path: Path, *, inside: str = "") -> Path:
+    """Pack the files of a folder, in a folder of this name if there is one."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in sorted(folder.rglob("*")):
+            archive.write(file, f"{inside}{file.relative_to(folder)}")
+    return path
+
+
+def unpack(path: Path, result: Path, *, overwrite: bool = False) -> Path:
+    return unpacked(path, result, overwrite=overwrite, reporter=Reporter())
+
+
+def entry(name: str, *, mode: int = stat.S_IFREG | 0o644) -> zipfile.ZipInfo:
+    made = zipfile.ZipInfo(name)
+    made.external_attr = mode << 16
+    return made
+
+
+@pytest.mark.parametrize("inside", ["", "my scan/", "exports/my scan/"])
+@pytest.mark.parametrize("name", ["kapture", "polycam", "record3d", "euroc", "nerfies"])
+def test_a_capture_in_an_archive_is_unpacked_beside_the_result(tmp_path, name, inside):
+    WITH_PHOTOS[name](VIEWS, tmp_path / "made")
+    suffix = ".r3d" if name == "record3d" else ".zip"
+    path = packed(tmp_path / "made", tmp_path / f"downloads.{name}{suffix}", inside=inside)
+    result = tmp_path / "results/scene"
+    folder = unpack(path, result)
+    assert folder.is_relative_to(tmp_path / f"results/downloads.{name}-unpacked")
+    assert recognise(folder)[0].name == name
+    scene = load_scene(folder)
+    np.testing.assert_allclose(sorted(f.centre.tolist() for f in scene.frames), sorted(PLACES.tolist()), atol=1e-12)
+    assert {item.name for item in tmp_path.iterdir()} == {"made", path.name, "results"}
+
+
+def test_a_conversion_of_an_archive_and_its_repetition(tmp_path):
+    WITH_PHOTOS["kapture"](VIEWS, tmp_path / "made")
+    path = packed(tmp_path / "made", tmp_path / "walk.zip")
+    notes: list[str] = []
+    reporter = Reporter(note=notes.append)
+    wanted = TargetOptions(format_named("nerfcli"))
+    convert_capture(path, tmp_path / "out/scene", wanted, reporter=reporter)
+    assert notes[0] == f"{tmp_path}/out/walk-unpacked: 5 files of walk.zip"
+    assert len(load_scene(tmp_path / "out/scene").frames) == 2
+    again = TargetOptions(format_named("nerfcli"), overwrite=True)
+    convert_capture(path, tmp_path / "out/scene", again, reporter=reporter)
+    assert f"{tmp_path}/out/walk-unpacked is kept: it has the files of walk.zip" in notes
+
+
+def test_another_archive_of_this_name_replaces_the_files_only_if_it_may(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a/one.txt").write_text("one")
+    path = packed(tmp_path / "a", tmp_path / "walk.zip")
+    folder = unpack(path, tmp_path / "scene")
+    (tmp_path / "a/one.txt").rename(tmp_path / "a/two.txt")
+    packed(tmp_path / "a", path)
+    with pytest.raises(UserError, match=r"walk-unpacked contains the files of another walk.zip") as caught:
+        unpack(path, tmp_path / "scene")
+    assert "--overwrite" in caught.value.hint
+    assert unpack(path, tmp_path / "scene", overwrite=True) == folder
+    assert sorted(item.name for item in folder.iterdir()) == ["archive.json", "two.txt"]
+    (folder / "archive.json").unlink()
+    with pytest.raises(UserError, match=r"cannot unpack .*: it contains other files"):
+        unpack(path, tmp_path / "scene", overwrite=True)
+
+
+@pytest.mark.parametrize(
+    "name", ["../out.txt", "a/../../out.txt", "/tmp/out.txt", "C:/out.txt", "..\\out.txt", "a\nb.txt", "\\\\host\\out"]
+)
+def test_names_that_lead_elsewhere_are_refused(tmp_path, name):
+    path = tmp_path / "bad.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(entry("good.txt"), "good")
+        archive.writestr(entry(name), "bad")
+    with pytest.raises(UserError, match="is not safe to unpack: it has a file named") as caught:
+        unpack(path, tmp_path / "results/scene")
+    assert caught.value.exit_code == BAD_INPUT
+    assert [item.name for item in tmp_path.iterdir()] == ["bad.zip"]
+
+
+def test_links_encrypted_files_and_equal_names_are_refused(tmp_path):
+    path = tmp_path / "bad.zip"
+    for made, what in (
+        ([entry("link", mode=stat.S_IFLNK | 0o777)], "link is a link or a device"),
+        ([entry("a/B.txt"), entry("a/b.txt")], "a/b.txt is in it twice"),
+        ([], "contains no files"),
+    ):
+        with zipfile.ZipFile(path, "w") as archive:
+            for each in made:
+                archive.writestr(each, "/etc")
+        with pytest.raises(UserError, match=what):
+            unpack(path, tmp_path / "scene")
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.txt", "a")
+    data = bytearray(path.read_bytes())
+    data[6] |= 1  # bit 0 of the flags, in both headers
+    data[data.index(b"PK\x01\x02") + 8] |= 1
+    path.write_bytes(data)
+    with pytest.raises(UserError, match=r"bad.zip is encrypted"):
+        unpack(path, tmp_path / "scene")
+
+
+def test_a_bomb_is_refused_before_anything_is_written(tmp_path):
+    path = tmp_path / "bomb.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for index in range(11):
+            archive.writestr(f"{index}.txt", bytes(10 << 20))
+    assert path.stat().st_size < 200_000  # 115 MB of zeros
+    with pytest.raises(UserError, match=r"is not safe to unpack: it says that it has 11 files of 0.1 GB in 0.1 MB"):
+        unpack(path, tmp_path / "scene")
+    assert [item.name for item in tmp_path.iterdir()] == ["bomb.zip"]
+
+
+def test_sizes_that_are_stated_too_small_and_full_disks_leave_nothing(tmp_path, monkeypatch):
+    path = tmp_path / "liar.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.txt", bytes(1 << 20))
+    data = bytearray(path.read_bytes())
+    place = data.index(b"PK\x01\x02") + 24  # the size in the central directory
+    data[place : place + 4] = (1000).to_bytes(4, "little")
+    path.write_bytes(data)
+    with pytest.raises(UserError, match=r"liar.zip is not a readable zip archive"):
+        unpack(path, tmp_path / "scene")
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.txt", "abc")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Disk(free=2))
+    with pytest.raises(UserError, match=r"would need 0.0 GB, and .* has 0.0 GB"):
+        unpack(path, tmp_path / "scene")
+    assert [item.name for item in tmp_path.iterdir()] == ["liar.zip"]
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.99])
+def test_a_truncated_archive_is_refused_and_leaves_nothing(tmp_path, share):
+    WITH_PHOTOS["kapture"](VIEWS, tmp_path / "made")
+    path = packed(tmp_path / "made", tmp_path / "walk.zip")
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(UserError, match=r"walk.zip is not a readable zip archive"):
+        unpack(path, tmp_path / "scene")
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["made", "walk.zip"]
+
+
+def test_what_systems_add_is_left_out(tmp_path):
+    path = tmp_path / "mac.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in ("walk/a.txt", "__MACOSX/walk/._a.txt", "walk/.DS_Store", "walk/._a.txt"):
+            archive.writestr(name, "a")
+    folder = unpack(path, tmp_path / "scene")
+    assert [item.name for item in folder.iterdir()] == ["a.txt"]
+
+
+def test_commands_without_a_result_say_how_to_unpack(tmp_path):
+    path = packed(WITH_PHOTOS["nerfies"](VIEWS, tmp_path / "made").parent, tmp_path / "walk.zip")
+    for refuse in (recognise, describe, load_scene):
+        with pytest.raises(UserError, match=r"walk.zip is an archive") as caught:
+            refuse(path)
+        assert "nerfcli convert" in caught.value.hint
+
+
+def test_frames_of_a_video_are_written_beside_the_result(tmp_path):
+    """Each photo is the video's frame of its number: its brightness says which."""
+    poses = np.tile(POSES, (3, 1, 1))
+    WITH_PHOTOS["stray-scanner"](Views(VIEWS.camera, poses), tmp_path / "scan")
+    for photo in (tmp_path / "scan/rgb").iterdir():
+        photo.unlink()
+    levels = [20, 60, 100, 140, 180, 220]
+    encode(tmp_path / "scan/rgb.mp4", [np.full((48, 64, 3), level, np.uint8) for level in levels])
+    with pytest.raises(UserError, match=r"none of its 6 photos is on disk") as caught:
+        load_scene(tmp_path / "scan")
+    assert "they are frames of rgb.mp4; nerfcli convert" in caught.value.hint
+    wanted = TargetOptions(format_named("nerfcli"))
+    convert_capture(tmp_path / "scan", tmp_path / "out/room-scene", wanted)
+    scene = load_scene(tmp_path / "out/room-scene")
+    assert [frame.name for frame in scene.frames] == [f"frame_{index:06d}.jpg" for index in range(6)]
+    for index, frame in enumerate(scene.frames):
+        assert frame.image is not None
+        assert frame.image.parent == tmp_path / "out/room-frames"
+        assert abs(read_image(frame.image).mean() - levels[index]) < 3
+        np.testing.assert_allclose(frame.centre, PLACES[index % 2], rtol=0, atol=1e-12)
+    assert sorted(item.name for item in (tmp_path / "scan").iterdir()) == [
+        "camera_matrix.csv",
+        "odometry.csv",
+        "rgb",
+        "rgb.mp4",
+    ]
