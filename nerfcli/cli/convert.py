@@ -38,7 +38,9 @@ _AXES = "opencv (= rdf), opengl (= rub), llff (= drb), pytorch3d (= luf), ros (=
 
 Source = Annotated[
     str,
-    typer.Argument(metavar="IN", help="Capture to read: file or folder, or - to read paths from standard input."),
+    typer.Argument(
+        metavar="IN", help="Capture to read: file, folder or zip archive, or - to read paths from standard input."
+    ),
 ]
 Target = Annotated[
     Path | None,
@@ -196,10 +198,12 @@ def convert(
 
     \b
     Formats read:     nerfcli, colmap, transforms (nerfstudio, instant-ngp), blender, llff, opensfm, metashape,
-                      reality-capture, alicevision (Meshroom), bundler, polycam, record3d, mvsnet (also BlendedMVS),
-                      neus (also IDR), pose-files (a matrix per photo, as in ScanNet, 7-Scenes, NSVF), tum, kitti,
-                      camera-path (nerfstudio's viewer), run (a folder written by nerfcli train, with its refined
-                      cameras); detected from the files
+                      reality-capture and realityscan-xmp, alicevision (Meshroom), openmvg, kapture, bundler, polycam,
+                      record3d, stray-scanner, 3d-scanner-app, nerfies (also HyperNeRF), scannetpp, euroc, tum-rgbd,
+                      mvsnet (also BlendedMVS), neus (also IDR), pose-files (a matrix per photo, as in ScanNet,
+                      7-Scenes, NSVF), tum, kitti, camera-path (nerfstudio's viewer), run (a folder written by
+                      nerfcli train, with its refined cameras); detected from the files. Archives (.zip, .r3d) are
+                      unpacked beside OUT, as are frames of a video that is part of a capture.
     Formats written:  nerfcli (a scene folder), colmap, colmap-text, transforms (nerfstudio, instant-ngp), blender,
                       llff, opensfm, tum, kitti, ply (points only)
 
@@ -222,6 +226,7 @@ def convert(
       nerfcli convert colmap-project metric-scene --to nerfcli --distance "a.jpg b.jpg 1.25"
       nerfcli convert strange/ --detect
       nerfcli convert strange/ repaired.json --to transforms --from-axes opencv --from-inverted
+      nerfcli convert capture.zip office-scene --to nerfcli
       ls -d captures/*/ | nerfcli convert - converted/ --to transforms
     """
     console, overrides = printing.console, read.overrides()

@@ -114,7 +114,10 @@ class MatchingOptions:
 
 @command
 def poses(
-    photos: Annotated[str, typer.Argument(help="Folder of photos or a video, or - to read paths from standard input.")],
+    photos: Annotated[
+        str,
+        typer.Argument(help="Folder of photos, zip archive of one, or video; or - to read paths from standard input."),
+    ],
     *,
     writing: options.Writing,
     taken: PhotoOptions,
@@ -130,7 +133,8 @@ def poses(
 
     Uses pycolmap. Writes PHOTOS-scene/ with a COLMAP model, scene.json and poses_report.json. Photos are neither
     copied nor changed. Photos that do not register are listed with the reason. For a video, the sharpest frames are
-    first written to VIDEO-frames/; parts where the camera stands still are skipped.
+    first written to VIDEO-frames/; parts where the camera stands still are skipped. An archive is unpacked beside the
+    scene.
 
     Run the same command again to resume an interrupted one. database.db stays in the scene: with --overwrite and other
     settings, only the steps that depend on them are repeated.

@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 
 @command
 def run(
-    photos: Annotated[str, typer.Argument(help="Folder of photos or a video, or - to read paths from standard input.")],
+    photos: Annotated[
+        str,
+        typer.Argument(help="Folder of photos, zip archive of one, or video; or - to read paths from standard input."),
+    ],
     *,
     writing: options.Writing,
     taken: PhotoOptions,

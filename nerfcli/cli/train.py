@@ -109,9 +109,9 @@ def train(
     """Fit a radiance field to a scene.
 
     SCENE is a folder written by `nerfcli poses`, or a file or folder of any other format that `nerfcli convert` reads
-    (COLMAP, nerfstudio, instant-ngp, Blender, LLFF, Metashape, ...), with photos on disk. The held-out photos are those
-    of the scene, else every 8th photo, or those of --holdout. Writes SCENE-run/. Ctrl-C or SIGTERM saves a checkpoint;
-    --resume continues from it.
+    (COLMAP, nerfstudio, instant-ngp, Blender, LLFF, Metashape, ...), with photos on disk; a zip archive of one is
+    unpacked beside the run. The held-out photos are those of the scene, else every 8th photo, or those of --holdout.
+    Writes SCENE-run/. Ctrl-C or SIGTERM saves a checkpoint; --resume continues from it.
 
     \b
     Components, for --with and --without:

@@ -17,7 +17,16 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
-from nerfcli.captures.formats.fields import content_lines, malformed, name_of, numbers, read_text, shown, size_of
+from nerfcli.captures.formats.fields import (
+    check_unique_names,
+    content_lines,
+    malformed,
+    name_of,
+    numbers,
+    read_text,
+    shown,
+    size_of,
+)
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.limits import quaternion_pose, rigid_pose
 from nerfcli.captures.formats.photo_names import find_photos
@@ -25,7 +34,7 @@ from nerfcli.captures.formats.timed_poses import poses_at
 from nerfcli.errors import listed, several
 
 HOME, TRUTH = "mav0", "state_groundtruth_estimate0"
-_TRUTHS = (TRUTH, "mocap0", "vicon0")
+_TRUTHS = (TRUTH, "mocap0")  # the latter of TUM VI, in the same layout
 _BROWN = ("radial-tangential", "radtan", "plumb_bob", "none")
 _FISHEYE = ("equidistant", "equi")
 _EXPECTED = "expected a file of a EuRoC sequence"
@@ -56,6 +65,7 @@ def parse_euroc(home: Path, *, images: Path | None = None) -> Capture:
     if not len(kept):
         raise malformed(str(truth), "has no pose at the time of a photo", "copy the whole sequence")
     names = [names[index] for index in kept]
+    check_unique_names(names, home)
     sizes = [cameras[views[index]][0].size for index in kept]
     found = find_photos(names, [home], given=images, sizes=sizes)
     frames = []
