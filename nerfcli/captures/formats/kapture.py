@@ -123,10 +123,9 @@ def _transform(row: _Row) -> np.ndarray | None:
     if not all(cells):
         return None
     values = np.array(numbers(cells, 7, row.where))
-    length = np.linalg.norm(values[:4])
-    if not length > 0:
+    if not values[:4].any():
         raise malformed(row.where, "its quaternion has length 0", "expected qw, qx, qy, qz")
-    return rigid.from_parts(rigid.rotation_from_quaternion(values[:4] / length), values[4:])
+    return rigid.from_parts(rigid.rotation_from_quaternion(values[:4]), values[4:])
 
 
 def _camera(row: _Row, given: Camera | None) -> Camera:
