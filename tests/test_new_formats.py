@@ -391,7 +391,8 @@ class TestTumRgbd:
     def test_photos_between_two_poses(self, tmp_path):
         WITH_PHOTOS["tum-rgbd"](VIEWS, tmp_path)
         quarter = f"{numbers(PLACES[0])} 0 0 {math.sqrt(0.5)!r} {math.sqrt(0.5)!r}"
-        text(tmp_path / "groundtruth.txt", f"10.00 {numbers(PLACES[0])} 0 0 0 1\n10.02 {quarter}\n")
+        head = "timestamp tx ty tz qx qy qz qw"  # as in copies that were prepared for pandas
+        text(tmp_path / "groundtruth.txt", f"{head}\n10.00 {numbers(PLACES[0])} 0 0 0 1\n10.02 {quarter}\n")
         text(tmp_path / "rgb.txt", "10.01 rgb/0.png\n10.5 rgb/1.png\n")
         capture = parse(tmp_path)
         eighth = rigid.rotation_from_vector(np.array([0, 0, math.pi / 4]))

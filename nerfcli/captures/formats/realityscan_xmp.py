@@ -8,18 +8,19 @@ Source: Epic, "RealityCapture XMP Camera Math"; RealityScan's help, "XMP alignme
 Fraunhofer-IIS/camorph, model RealityCapture (names of the models of distortion).
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed, numbers, read_xml, shown
 from nerfcli.captures.formats.format import Format
-from nerfcli.captures.formats.limits import rigid_pose
+from nerfcli.captures.formats.lens_fits import Fits
+from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.formats.reality_capture import camera_of_values
 from nerfcli.captures.orientation import Measure, stored_size
@@ -31,8 +32,6 @@ _NAMESPACE = b"capturingreality.com/ns/xcr"
 _SUFFIX = ".xmp"
 _MODELS = ("perspective", "brown3", "brown3t2", "brown4", "brown4t2")
 _TERMS = ("k1", "k2", "k3", "k4", "t1", "t2")
-# The skew counts as rounding if it shifts the edge of the picture by at most this fraction of its longer side.
-_NEGLIGIBLE_SKEW = 1e-6
 
 
 def parse_realityscan_xmp(folder: Path, measure: Measure, *, images: Path | None = None) -> Capture:
@@ -58,12 +57,14 @@ def parse_realityscan_xmp(folder: Path, measure: Measure, *, images: Path | None
         raise malformed(str(folder), "its XMP files have no poses", "align the photos, and export XMP with poses")
     found = find_photos([path.stem for path, _ in posed], [folder], given=images)
     found = found.required(str(folder), "they give the sizes of the pictures")
-    frames = []
+    fits, poses, frames = Fits(), FramePoses(), []
     for (path, value), image in zip(posed, found.paths, strict=True):
         if image is not None:
-            camera = _camera(value, stored_size(image, measure), str(path))
-            frames.append(Frame(image.name, camera, _pose(value, str(path)), image=image))
-    notes = list(found.notes)
+            camera = _camera(value, stored_size(image, measure), str(path), fits)
+            pose = poses.read(image.name, f"{path}: Rotation", partial(_pose, value, str(path)))
+            if pose is not None:
+                frames.append(Frame(image.name, camera, pose, image=image))
+    notes = [*found.notes, *poses.notes(), *fits.notes()]
     if without:
         names = listed([path.name for path, _ in without])
         notes.append(f"{several(len(without), 'XMP file')} without a pose in the scene left out: {names}")
@@ -91,11 +92,10 @@ def _values(path: Path) -> dict[str, str]:
 def _pose(value: dict[str, str], where: str) -> np.ndarray:
     rotation = np.array(numbers(value["Rotation"].split(), 9, f"{where}: Rotation")).reshape(3, 3)
     position = np.array(numbers(value["Position"].split(), 3, f"{where}: Position"))
-    turned = rigid_pose(np.column_stack([rotation.T, position]), f"{where}: Rotation")
-    return rigid.from_parts(turned[:3, :3], position)
+    return np.column_stack([rotation.T, position])
 
 
-def _camera(value: dict[str, str], size: tuple[int, int], where: str) -> Camera:
+def _camera(value: dict[str, str], size: tuple[int, int], where: str, fits: Fits) -> Camera:
     def number(key: str, default: Any) -> float:
         return numbers(value.get(key, default).split(), 1, f"{where}: {key}")[0]
 
@@ -111,15 +111,15 @@ def _camera(value: dict[str, str], size: tuple[int, int], where: str) -> Camera:
             f"DistortionModel is {shown(model)}, which is not supported",
             "set Alignment Settings > Advanced > Distortion model to Brown3, align, and export again",
         )
-    if abs(number("Skew", "0")) > _NEGLIGIBLE_SKEW:
-        raise malformed(where, f"Skew is {value['Skew']}", "skew is not supported: no camera model here has it")
     intrinsics = {
         "f": number("FocalLength35mm", ""),
         "px": number("PrincipalPointU", "0"),
         "py": number("PrincipalPointV", "0"),
+        "skew": number("Skew", "0"),
+        "aspect": number("AspectRatio", "1"),
         **terms,
     }
-    return camera_of_values(intrinsics, size, where, aspect=number("AspectRatio", "1"))
+    return camera_of_values(intrinsics, size, where, fits)
 
 
 def find_realityscan_xmp(path: Path) -> Path | None:

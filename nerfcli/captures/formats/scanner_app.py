@@ -8,7 +8,9 @@ Source: pwais/psegs, "3DScannerApp Data Parsing"; laanlabs/ARBodyPoseRecorder, b
 """
 
 import re
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,8 +19,8 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed, read_json_object, vector
 from nerfcli.captures.formats.format import Format, has_keys
-from nerfcli.captures.formats.lenses import camera_of_matrix
-from nerfcli.captures.formats.limits import rigid_pose
+from nerfcli.captures.formats.lens_fits import Fits
+from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
@@ -45,26 +47,31 @@ def parse_scanner_app(folder: Path, measure: Measure, *, images: Path | None = N
     files = frame_files(folder)
     found = find_photos([path.stem for path in files], [folder], given=images)
     found = found.required(str(folder), "they give the sizes of the pictures")
-    frames, without = [], 0
+    fits, poses, frames, without = Fits(), FramePoses(), [], 0
     for path, image in zip(files, found.paths, strict=True):
         if image is None:
             without += 1
             continue
         where, record = str(path), read_json_object(path)
         matrix = vector(record, "intrinsics", 9, where).reshape(3, 3)
-        pose = vector(record, _POSE, 16, where).reshape(4, 4)
-        if pose[3].tolist() != [0, 0, 0, 1]:
-            raise malformed(where, f"{_POSE} is not a pose row by row", "expected a last row 0, 0, 0, 1")
-        camera = camera_of_matrix(matrix, stored_size(image, measure), f"{where}: intrinsics")
-        world_from_cam = opencv_from_opengl_pose(rigid_pose(pose, f"{where}: {_POSE}"))
-        frames.append(Frame(image.name, camera, world_from_cam, image=image))
-    notes = found.notes
+        camera = fits.matrix(matrix, stored_size(image, measure), f"{where}: intrinsics")
+        pose = poses.read(image.name, f"{where}: {_POSE}", partial(_matrix, record, where))
+        if pose is not None:
+            frames.append(Frame(image.name, camera, opencv_from_opengl_pose(pose), image=image))
+    notes = (*found.notes, *poses.notes(), *fits.notes())
     if without:
         notes += (f"{len(frames)} of the {len(files)} frames with a pose have a photo",)
     source = "ARKit (3D Scanner App)"
     return Capture(
         tuple(frames), np.zeros((0, 3)), kind="3d-scanner-app", unit="metre", unit_source=source, notes=notes
     )
+
+
+def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
+    matrix = vector(record, _POSE, 16, where).reshape(4, 4)
+    if matrix[3].tolist() != [0, 0, 0, 1]:
+        raise malformed(where, f"{_POSE} is not a pose row by row", "expected a last row 0, 0, 0, 1")
+    return matrix
 
 
 def find_scanner_app(path: Path) -> Path | None:

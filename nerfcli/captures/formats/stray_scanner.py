@@ -16,7 +16,7 @@ from nerfcli.cameras.frame import Frame, Size
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text
 from nerfcli.captures.formats.format import Format
-from nerfcli.captures.formats.lenses import camera_of_matrix
+from nerfcli.captures.formats.lens_fits import Fits
 from nerfcli.captures.formats.limits import quaternion_pose
 from nerfcli.captures.formats.photo_names import GIVE_PHOTOS, FoundPhotos, find_photos
 from nerfcli.captures.orientation import Measure, stored_size
@@ -49,7 +49,7 @@ def parse_stray_scanner(folder: Path, measure: Measure, *, images: Path | None =
     size = stored_size(there[0], measure) if there else _size_of_video(folder)
     has_lenses = all(key in row for row in rows.values() for key in _LENS)
     matrix = np.eye(3) if has_lenses else _matrix(folder / MATRIX)
-    frames = []
+    fits, frames = Fits(), []
     for row, name, image in zip(rows.values(), found.names, found.paths, strict=True):
         if image is None and there:
             continue
@@ -57,11 +57,11 @@ def parse_stray_scanner(folder: Path, measure: Measure, *, images: Path | None =
         if has_lenses:
             matrix = np.array([[row["fx"], 0, row["cx"]], [0, row["fy"], row["cy"]], [0, 0, 1]])
         pose = np.array([row[key] for key in _POSE])
-        camera = camera_of_matrix(matrix, size, where if has_lenses else str(folder / MATRIX))
+        camera = fits.matrix(matrix, size, where if has_lenses else str(folder / MATRIX))
         world_from_cam = quaternion_pose(pose[:4], pose[4:], where)
         frames.append(Frame(name if image is None else image.name, camera, world_from_cam, image=image))
     check_unique_names((frame.name for frame in frames), path)
-    notes = found.notes
+    notes = (*found.notes, *fits.notes())
     if there and len(there) < len(rows):
         notes += (f"{len(there)} of the {len(rows)} frames with a pose have a photo",)
     return Capture(

@@ -107,6 +107,11 @@ def _parse(
     return Capture(frames, np.zeros((0, 3)), kind=kind, notes=notes)
 
 
+def timed_lines(text: str) -> list[tuple[int, str]]:
+    """Return what `content_lines` returns, without a line of names that has lost its "#"."""
+    return [(number, line) for number, line in content_lines(text) if not line.lower().lstrip().startswith("timestamp")]
+
+
 def tum_poses(path: Path) -> tuple[list[tuple[str, np.ndarray]], tuple[str, ...]]:
     """Read the timestamps and poses `world_from_cam` of a trajectory in the TUM format, and notes of what was left out.
 
@@ -123,7 +128,7 @@ def _poses(
     expected: str,
 ) -> tuple[list[tuple[str, np.ndarray]], tuple[str, ...]]:
     read, poses = FramePoses(), []
-    for index, (number, line) in enumerate(content_lines(read_text(path, expected))):
+    for index, (number, line) in enumerate(timed_lines(read_text(path, expected))):
         name, world_from_cam = pose_of(read, index, line.split(), f"{path}: line {number}")
         if world_from_cam is not None:
             poses.append((name, world_from_cam))

@@ -17,11 +17,11 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
-from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, name_of, numbers, read_text
+from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, numbers, read_text
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, find_photos
 from nerfcli.captures.formats.timed_poses import poses_at
-from nerfcli.captures.formats.trajectories import tum_poses
+from nerfcli.captures.formats.trajectories import timed_lines, tum_poses
 from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import UserError, listed, several
@@ -52,13 +52,13 @@ def parse_tum_rgbd(
     """
     path = folder / PHOTOS
     seconds, names = [], []
-    for line_number, line in content_lines(read_text(path, "expected lines of timestamp and file")):
+    for line_number, line in timed_lines(read_text(path, "expected lines of timestamp and file")):
         where = f"{path}: line {line_number}"
         time, _, file = line.strip().partition(" ")
         seconds += numbers([time], 1, where)
         names.append(name_of(file, where))
     check_unique_names(names, path)
-    poses = tum_poses(folder / TRUTH)
+    poses, lost = tum_poses(folder / TRUTH)
     times = np.array([float(name) for name, _ in poses])
     interpolated, is_known = poses_at(times, np.stack([pose for _, pose in poses]), np.array(seconds))
     kept, unposed = np.flatnonzero(is_known), [names[index] for index in np.flatnonzero(~is_known)]
@@ -72,7 +72,7 @@ def parse_tum_rgbd(
         Frame(name, camera, interpolated[index], image=image or (images or folder) / name)
         for index, name, image in zip(kept, found.names, found.paths, strict=True)
     )
-    notes = found.notes
+    notes = (*found.notes, *lost)
     if unposed:
         notes += (f"{several(len(unposed), 'photo')} left out, as no pose is near in time: {listed(unposed)}",)
     points, source = np.zeros((0, 3)), "motion capture (TUM RGB-D)"
