@@ -220,10 +220,9 @@ class TestRealityScanXmp:
         [
             ('DistortionModel="brown3"', 'DistortionModel="division"', "DistortionModel is 'division'"),
             ('DistortionModel="brown3"', 'DistortionModel="rationalP2D1"', "DistortionModel is 'rationalp2d1'"),
-            ("0.1 0 0 0 0 0", "0.1 0 0 0.2 0 0", "k4 is 0.2"),
             ("0.1 0 0 0 0 0", "0.1 0 0", "DistortionCoeficients: has 3 numbers"),
             ("xcr:FocalLength35mm=", "xcr:Focal=", "FocalLength35mm: has 0 numbers"),
-            ("xcr:Version", 'xcr:Skew="0.01" xcr:Version', "Skew is 0.01"),
+            ("xcr:Version", 'xcr:Skew="0.05" xcr:Version', "skew is 3.2, which no supported lens has"),
             ("</xcr:Position>", " 4</xcr:Position>", "Position: has 4 numbers"),
             ("<x:xmpmeta", "<!DOCTYPE a><x:xmpmeta", "declares a document type"),
         ],
@@ -235,6 +234,19 @@ class TestRealityScanXmp:
         with pytest.raises(UserError, match=f"1.xmp: .*{what}|1.xmp: {what}") as caught:
             parse(tmp_path)
         assert caught.value.exit_code == BAD_INPUT
+
+
+def test_a_frame_whose_tracking_was_lost_is_left_out_and_named(tmp_path):
+    three = Views(CAMERA, np.concatenate([POSES, POSES[:1]]))
+    WITH_PHOTOS["3d-scanner-app"](three, tmp_path / "app")
+    WITH_PHOTOS["realityscan-xmp"](three, tmp_path / "xmp")
+    pose = json.loads((tmp_path / "app/frame_00001.json").read_text())["cameraPoseARFrame"]
+    change_json(tmp_path / "app/frame_00001.json", cameraPoseARFrame=[math.nan, *pose[1:]])
+    text(tmp_path / "xmp/1.xmp", re.sub("Position>[^<]*<", "Position>nan 0 0<", (tmp_path / "xmp/1.xmp").read_text()))
+    for place, name in (("app", "frame_00001.jpg"), ("xmp", "1.jpg")):
+        capture = parse(tmp_path / place)
+        assert len(capture.frames) == 2
+        assert capture.notes[0].startswith(f"1 of 3 frames left out: {name} (")
 
 
 class TestOpenMvg:

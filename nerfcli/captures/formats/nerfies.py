@@ -9,12 +9,12 @@ depth/1x/NAME.npy in DyCheck: z in units of 1 / scale, zero where it is not know
 Source: google/nerfies nerfies/camera.py, nerfies/datasets/nerfies.py; KAIR-BAIR/dycheck docs/DATASETS.md.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
@@ -29,7 +29,7 @@ from nerfcli.captures.formats.fields import (
     vector,
 )
 from nerfcli.captures.formats.format import Format, has_keys
-from nerfcli.captures.formats.limits import plausible, rigid_pose
+from nerfcli.captures.formats.limits import FramePoses, plausible
 from nerfcli.captures.formats.npy import DAMAGED, array_of_npy
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.errors import listed, several
@@ -63,14 +63,17 @@ def parse_nerfies(folder: Path, *, images: Path | None = None) -> Capture:
     homes = [folder / there[0]] if there else [folder]
     found = find_photos(names, homes, given=images, sizes=[camera.size for camera, _ in views])
     splits = {**dict.fromkeys(train, "train"), **dict.fromkeys(held_out, "val")} if held_out else {}
-    frames = []
+    poses, frames = FramePoses(), []
     for name, (camera, record), image in zip(names, views, found.paths, strict=True):
-        pose = _pose(record, str(folder / CAMERAS / f"{name}.json"))
+        where = str(folder / CAMERAS / f"{name}.json")
+        pose = poses.read(name, f"{where}: orientation", partial(_pose, record, where))
+        if pose is None:
+            continue
         place = image or (images or homes[0]) / name
         frames.append(Frame(place.name, camera, pose, image=place, split=splits.get(name)))
     if not frames:
         raise malformed(str(folder), f"has no file in {CAMERAS}/ of the photos in {DATASET}", "copy the whole capture")
-    notes = found.notes
+    notes = (*found.notes, *poses.notes())
     if unposed:
         notes += (f"{several(len(unposed), 'photo')} without a camera left out: {listed(unposed)}",)
     bounds = _depth_bounds(folder / "scene.json", len(frames))
@@ -115,8 +118,7 @@ def _pose(record: dict[str, Any], where: str) -> np.ndarray:
         raise malformed(where, f"orientation is {shown(rows)}", "expected 3 rows of 3 numbers")
     rotation = np.stack([vector({"orientation": row}, "orientation", 3, where) for row in rows])
     position = vector(record, "position", 3, where)
-    turned = rigid_pose(np.column_stack([rotation.T, position]), f"{where}: orientation")
-    return rigid.from_parts(turned[:3, :3], position)
+    return np.column_stack([rotation.T, position])
 
 
 def _depth_bounds(path: Path, count: int) -> np.ndarray | None:

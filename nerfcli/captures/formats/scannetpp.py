@@ -7,6 +7,7 @@ are blurred or show a shadow of the photographer. dslr/colmap is a COLMAP model,
 Source: scannetpp/scannetpp common/utils/nerfstudio.py, common/scene_release.py; nerfstudio scannetpp_dataparser.py.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, read_json_object, shown, vector
 from nerfcli.captures.formats.format import Format, has_keys
-from nerfcli.captures.formats.limits import rigid_pose
+from nerfcli.captures.formats.lens_fits import Fits
+from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.formats.transforms_cameras import camera_of_record, given_size
 from nerfcli.errors import several
@@ -52,21 +54,24 @@ def parse_scannetpp(path: Path, *, images: Path | None = None) -> Capture:
     check_unique_names(names, path)
     sizes = [_size(record, where) for record, _, where in records]
     found = find_photos(names, [home], given=images, folders=(f"{kind}_images", "images"), sizes=sizes)
-    frames = []
+    fits, poses, frames = Fits(), FramePoses(), []
     for (record, split, where), size, name, image in zip(records, sizes, found.names, found.paths, strict=True):
+        pose = poses.read(name, f"{where}: transform_matrix", partial(_matrix, record, where))
+        if pose is None:
+            continue
         mask = record.get("mask_path")
         mask = home / f"{kind}_anon_masks" / name_of(mask, f"{where}: mask_path") if mask else None
         frames.append(
             Frame(
                 name,
-                camera_of_record(record, size, where),
-                opencv_from_opengl_pose(rigid_pose(_matrix(record, where), f"{where}: transform_matrix")),
+                camera_of_record(record, size, where, fits),
+                opencv_from_opengl_pose(pose),
                 image=image or (images or home / f"{kind}_images") / name,
                 mask=mask if mask is not None and mask.is_file() else None,
                 split=split if has_split else None,
             )
         )
-    notes = found.notes
+    notes = (*found.notes, *poses.notes(), *fits.notes())
     if bad:
         notes += (f"{several(bad, 'photo')} marked as bad left out",)
     points, source = np.zeros((0, 3)), "laser scan (ScanNet++)"
