@@ -182,7 +182,7 @@ def test_a_capture_of_heic_photos_is_trained_evaluated_and_converted(capture: Pa
     assert nerfcli("evaluate", run).exit_code == 0
     converted = nerfcli("convert", capture, tmp_path / "colmap", "--to", "colmap", "--allow-loss")
     assert converted.exit_code == 0, converted.stderr
-    assert "the photos are HEIC, which many other programs cannot read" in converted.stderr
+    assert "the photos are .heic files, which many other programs cannot read" in converted.stderr
     assert "HEIC" not in nerfcli("convert", capture, tmp_path / "scene", "--to", "nerfcli").stderr
     (measured,) = json.loads((run / "metrics.json").read_text())["images"]
     assert measured["pixels"] == 96 * 72

@@ -9,7 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import pillow_heif
 import pytest
 from examples import examples
 from hypothesis import given, settings
@@ -19,7 +21,18 @@ from PIL.TiffImagePlugin import IFDRational
 
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.photos.exif import read_exif
-from nerfcli.photos.images import downscale, image_size, list_images, read_image, write_png
+from nerfcli.photos.images import (
+    HEIC_SUFFIXES,
+    IMAGE_SUFFIXES,
+    downscale,
+    image_size,
+    list_images,
+    list_unreadable,
+    read_image,
+    skipped_files,
+    write_png,
+)
+from nerfcli.poses.input.photos import find_photos
 
 # Linear red, green, blue to XYZ (D50), Bradford-adapted, a column each: IEC 61966-2-1 and SMPTE EG 432-1.
 SRGB = ((0.43607, 0.22250, 0.01393), (0.38506, 0.71688, 0.09710), (0.14308, 0.06062, 0.71417))
@@ -129,7 +142,7 @@ def test_write_png_refuses_what_is_no_8_bit_picture(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tif"])
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".pgm"])
 def test_grey_pixels_of_16_bits_keep_their_high_byte(tmp_path, suffix):
     path = tmp_path / f"grey{suffix}"
     wide = np.array([[0, 255, 256, 257], [32768, 65279, 65280, 65535]], dtype=np.uint16)
@@ -292,6 +305,89 @@ def test_list_images_is_sorted_and_takes_pictures_only(tmp_path):
         list_images(tmp_path / "nothing")
     with pytest.raises(UserError, match=r"cannot list the photos in .*notes\.txt: Not a directory"):
         list_images(tmp_path / "notes.txt")
+
+
+def test_list_images_leaves_out_a_conversion_of_the_same_photo(tmp_path):
+    for name in ("a.jpg", "a.HEIC", "b.avif", "c.png", "c.jp2", "d.gif", "e.jpg", "e.png"):
+        (tmp_path / name).touch()
+    assert [p.name for p in list_images(tmp_path)] == ["a.jpg", "b.avif", "c.png", "d.gif", "e.jpg", "e.png"]
+
+
+def test_files_that_are_no_photos_are_counted_by_their_suffix(tmp_path):
+    (tmp_path / "below").mkdir()
+    names = ("a.jpg", "a.heic", "b.dng", "c.mov", "d.MOV", "e.txt", "README", ".DS_Store", "Thumbs.db", "below/f.mov")
+    for name in names:
+        (tmp_path / name).touch()
+    assert skipped_files(tmp_path) == "2 .mov, 1 .heic, 1 .txt, 1 without a suffix"
+    assert skipped_files(tmp_path, subfolders=True).startswith("3 .mov, ")
+    with pytest.raises(UserError) as caught:
+        find_photos(tmp_path / "below")
+    assert caught.value.hint.startswith("there are only 1 .mov; expected files ending in .avif, .bmp")
+
+
+@pytest.mark.parametrize("suffix", sorted(IMAGE_SUFFIXES))
+def test_every_format_is_read_as_what_was_written(tmp_path, suffix):
+    """Exactly where the format is lossless, and within the levels that its compression costs on a smooth picture."""
+    y, x = np.mgrid[:48, :64]
+    picture = np.stack([4 * x, 5 * y, 255 - 4 * x], axis=-1).astype(np.uint8)
+    grey, black_and_white = Image.fromarray(picture[..., 0]), Image.fromarray(picture[..., 0] > 127)
+    image = {".pgm": grey, ".pbm": black_and_white}.get(suffix, Image.fromarray(picture))
+    path = tmp_path / f"a{suffix}"
+    if suffix in HEIC_SUFFIXES:
+        pillow_heif.from_pillow(image).save(path, quality=95)
+    else:
+        image.save(path)
+    levels = {".gif": 40, ".jpg": 12, ".jpeg": 12, ".jpe": 12, ".jfif": 12, ".mpo": 12}
+    allowed = levels.get(suffix, 12 if suffix in HEIC_SUFFIXES | {".avif", ".webp"} else 0)
+    found = read_image(path)
+    assert image_size(path) == (64, 48)
+    assert np.abs(found[..., :3].astype(int) - np.asarray(image.convert("RGB"))).max() <= allowed
+
+
+def test_the_first_picture_of_an_animation_and_of_a_stereo_pair_is_read(tmp_path):
+    first, second = (Image.fromarray(np.full((8, 8, 3), level, np.uint8)) for level in (40, 200))
+    for name, kind in (("a.gif", "GIF"), ("b.mpo", "MPO"), ("c.webp", "WEBP"), ("d.png", "PNG")):
+        first.save(tmp_path / name, kind, save_all=True, append_images=[second])
+        assert np.abs(read_image(tmp_path / name)[..., :3].astype(int) - 40).max() <= 2
+        assert read_exif(tmp_path / name).pages == 1
+
+
+@pytest.mark.parametrize("sizes", [((16, 12), (160, 120)), ((160, 120), (16, 12)), ((80, 60), (160, 120), (160, 120))])
+def test_the_largest_page_of_a_tiff_is_read(tmp_path, sizes):
+    """A scanner's preview may come first; of equal pages the first is taken."""
+    pages = [Image.fromarray(np.full((h, w, 3), 50 + 50 * i, np.uint8)) for i, (w, h) in enumerate(sizes)]
+    path = tmp_path / "scan.tif"
+    pages[0].save(path, save_all=True, append_images=pages[1:])
+    found = read_image(path)
+    assert image_size(path) == (160, 120)
+    np.testing.assert_array_equal(found, np.full((120, 160, 3), 50 + 50 * sizes.index((160, 120))))
+    assert read_exif(path).pages == len(sizes)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_float_pixels_are_named_as_the_reason(tmp_path, channels, kind):
+    cv2.imwrite(str(tmp_path / "merge.tif"), np.full((8, 8, channels), 0.5, kind))
+    with pytest.raises(UserError, match=r"merge\.tif has (float pixels|32-bit float pixels), whose white level"):
+        read_image(tmp_path / "merge.tif")
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("a.insp", "two circles of a 360-degree camera: export it as one equirectangular picture"),
+        ("a.CR3", "is a raw file: develop it"),
+        ("a.jxl", "is a JPEG XL file: convert"),
+        ("a.exr", "has float pixels, whose white level is unknown"),
+    ],
+)
+def test_photos_in_formats_that_are_not_read_say_what_to_do(tmp_path, name, reason):
+    """Even if the file could be opened: an .insp is a JPEG of two circles."""
+    Image.new("RGB", (8, 8)).save(tmp_path / name, "JPEG")
+    with pytest.raises(UserError, match=rf"{name} .*{reason}"):
+        read_image(tmp_path / name)
+    assert list_images(tmp_path) == []
+    assert [path.name for path in list_unreadable(tmp_path)] == [name]
 
 
 def downscaled_by_loops(image: np.ndarray, factor: float) -> np.ndarray:

@@ -78,8 +78,8 @@ def test_photos_in_formats_that_are_not_read_are_named_and_not_passed_over(folde
     photos = find_photos(folder)
     assert photos.names == ("a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg")
     assert photos.unreadable == {
-        "f.NEF": ".NEF files are not supported; convert them to JPEG",
-        "g.dng": ".dng files are not supported; convert them to JPEG",
+        "f.NEF": "a raw file: develop it to JPEG or 16-bit TIFF",
+        "g.dng": "a raw file: develop it to JPEG or 16-bit TIFF",
     }
 
 
@@ -94,7 +94,7 @@ def test_broken_links_are_named_and_not_passed_over(folder: Path):
 def test_a_folder_of_nothing_but_such_photos_says_so(tmp_path: Path):
     for number in range(4):
         (tmp_path / f"IMG_{number}.DNG").write_bytes(b"not for Pillow")
-    with pytest.raises(UserError, match=r"none of 4 photos in .* can be read.*IMG_0.DNG: .DNG files") as caught:
+    with pytest.raises(UserError, match=r"none of 4 photos in .* can be read.*IMG_0.DNG: a raw file") as caught:
         find_photos(tmp_path)
     assert caught.value.hint.startswith("convert these files to JPEG")
     assert [source.name for source in find_subject(tmp_path).sources] == [f"IMG_{number}.DNG" for number in range(4)]

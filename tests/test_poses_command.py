@@ -55,7 +55,7 @@ def test_the_plan_can_be_read_and_names_the_files_that_are_skipped(tmp_path: Pat
     photos = write_photos(tmp_path / "photos", 5)
     (photos / "IMG_1.cr3").write_bytes(b"raw")
     result = nerfcli("poses", photos, "--dry-run")
-    assert "IMG_1.cr3 is skipped: .cr3 files are not supported" in result.stderr
+    assert "IMG_1.cr3 is skipped: a raw file" in result.stderr
     assert result.stdout.startswith(f"{photos}: 5 photos, 10 pairs to match (retrieval), about ")
     assert result.stdout.endswith("; 0.5 GB of memory\n")
 

@@ -1,13 +1,14 @@
 """nerfcli.photos.video: frames come back upright, whole in number, at their times; other files are refused."""
 
 import io
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
-from clips import LOSSLESS, encode, ffmpeg
+from clips import LOSSLESS, encode, ffmpeg, pan
 from PIL import Image
 
 from nerfcli.errors import UserError
@@ -189,3 +190,102 @@ def test_what_is_no_video_is_reported(tmp_path):
 def test_a_frame_that_is_not_there(clip):
     with pytest.raises(UserError, match="is not a readable video"):
         list(read_frames(open_video(clip), [3, COUNT]))
+
+
+def hdr_clip(path: Path, signal: np.ndarray, transfer: str) -> Path:
+    """Write a video of grey patches with these signal values, 0...1, as a phone does: 10 bits, BT.2020."""
+    picture = np.repeat(np.rint(65535 * signal).astype("<u2"), 16)[None, :, None].repeat(16, 0).repeat(3, 2)
+    tags = f"setparams=color_primaries=bt2020:color_trc={transfer}:colorspace=bt2020nc:range=tv"
+    to_yuv = f"scale=out_color_matrix=bt2020:out_range=tv,format=yuv444p10,{tags}"
+    source = ("-f", "rawvideo", "-pix_fmt", "rgb48le", "-s", f"{picture.shape[1]}x16", "-i", "-")
+    ffmpeg(*source, "-vf", to_yuv, "-c:v", "ffv1", str(path), raw=np.ascontiguousarray(picture).tobytes())
+    return path
+
+
+def hlg_signal(nits: np.ndarray) -> np.ndarray:
+    """ITU-R BT.2100: the light of a scene that a screen of 1,000 cd/m2 shows with these luminances."""
+    light = (nits / 1000) ** (1 / 1.2)
+    log = 0.17883277 * np.log(np.maximum(12 * light - 0.28466892, 1e-9)) + 0.55991073
+    return np.where(light <= 1 / 12, np.sqrt(3 * light), log)
+
+
+def pq_signal(nits: np.ndarray) -> np.ndarray:
+    """SMPTE ST 2084."""
+    power = (nits / 10_000) ** 0.1593017578125
+    return ((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power)) ** 78.84375
+
+
+@pytest.mark.parametrize(("transfer", "signal"), [("arib-std-b67", hlg_signal), ("smpte2084", pq_signal)])
+def test_hdr_video_becomes_srgb_with_paper_white_at_203_nits(tmp_path, transfer, signal):
+    """Closed form below 0.7 of white, which is not compressed; above, brighter light stays brighter."""
+    linear = np.array([0.01, 0.05, 0.18, 0.4, 0.65, 1.0, 2.0])
+    video = open_video(hdr_clip(tmp_path / "a.mkv", signal(203 * linear), transfer))
+    assert video.hdr
+    (frame,) = read_frames(video, [0])
+    levels = frame[8, 8::16].astype(float)
+    assert (np.abs(levels - levels[:, :1]) <= 1).all()  # grey stays grey
+    srgb = 255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    np.testing.assert_allclose(levels[:5, 0], srgb[:5], atol=3)
+    assert levels[4, 0] + 10 < levels[5, 0] < levels[6, 0] <= 255
+
+
+FIELDS = ("-vf", "tinterlace=mode=interleave_top,setfield=mode={}", "-c:v", "ffv1")
+
+
+def swing(count: int) -> list[np.ndarray]:
+    """Views of a camera that moves sideways by 3 pixels a frame."""
+    return pan([3.0 * number for number in range(count)])
+
+
+@pytest.mark.parametrize("stated", ["tff", "prog"])
+def test_the_fields_of_interlaced_frames_are_taken_apart(tmp_path, stated):
+    """Each frame of the result is like the view at its first field, whatever the header says; combed ones are not."""
+    views = swing(48)
+    path = encode(tmp_path / "a.mkv", views, codec=[part.format(stated) for part in FIELDS], fps=60)
+    video = open_video(path)
+    measured = measure_frames(video, lambda f: 0, longer_side=999, progress=lambda fraction: None)
+    assert (video.fields, measured.fields) == (("auto", "auto") if stated == "tff" else ("", "tff"))
+    inner = np.s_[4:-4, 4:-4]
+
+    def off(video: Video) -> float:
+        found = read_frames(video, [8, 12, 15])
+        return float(
+            np.mean(
+                [
+                    np.abs(f[inner] - views[2 * n][inner].astype(float)).mean()
+                    for f, n in zip(found, (8, 12, 15), strict=True)
+                ]
+            )
+        )
+
+    assert off(replace(video, fields=measured.fields)) < 0.5 * off(replace(video, fields=""))
+
+
+def test_whole_frames_stay_whole_even_if_the_header_says_fields(tmp_path):
+    path = encode(tmp_path / "a.mkv", swing(24), codec=("-vf", "setfield=mode=tff", "-c:v", "ffv1"))
+    video = open_video(path)
+    assert video.fields == "auto"
+    assert measure_frames(video, lambda f: 0, longer_side=999, progress=lambda fraction: None).fields == ""
+
+
+def two_streams(folder: Path, sizes: tuple[str, str]) -> Path:
+    sources = [part for size in sizes for part in ("-f", "lavfi", "-i", f"testsrc2=s={size}:d=1")]
+    ffmpeg(*sources, "-map", "0:v", "-map", "1:v", "-c:v", "ffv1", str(folder / "two.mkv"))
+    return folder / "two.mkv"
+
+
+def test_of_two_streams_the_larger_is_read(tmp_path):
+    video = open_video(two_streams(tmp_path, ("64x48", "160x120")))
+    assert (video.width, video.height, video.stream, video.num_streams) == (160, 120, 1, 2)
+    assert next(read_frames(video, [3])).shape == (120, 160, 3)
+    with pytest.raises(UserError, match=r"two\.mkv has 2 video streams of 64x48 pixels") as caught:
+        open_video(two_streams(tmp_path, ("64x48", "64x48")))
+    assert "-map 0:0 -c copy" in caught.value.hint
+
+
+@pytest.mark.parametrize(("name", "hint"), [("VID_1.insv", "equirectangular MP4"), ("GX01.LRV", "give that video")])
+def test_videos_of_360_cameras_and_previews_say_what_to_give(clip, tmp_path, name, hint):
+    (tmp_path / name).write_bytes(clip.read_bytes())
+    with pytest.raises(UserError, match=name) as caught:
+        open_video(tmp_path / name)
+    assert hint in caught.value.hint

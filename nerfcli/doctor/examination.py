@@ -19,17 +19,21 @@ from nerfcli.doctor.pose_agreement import misplaced_groups, nearest_pairs, pair_
 from nerfcli.errors import UserError, in_shell
 from nerfcli.pages.findings import Finding, as_json, worst
 from nerfcli.photos.focal_evidence import focal_evidence, usual_focal_px
-from nerfcli.photos.images import list_photos, list_unreadable, name_in, where_photos_may_be
+from nerfcli.photos.images import list_photos, list_unreadable, name_in, skipped_files, where_photos_may_be
 from nerfcli.poses.judge.checks import Checks
 
 
 @dataclass(frozen=True)
 class ExaminedCapture:
-    """A capture to examine: its path as the user gave it, and the scene with the poses, None for a folder of photos."""
+    """A capture to examine: its path as the user gave it, and the scene with the poses, None for a folder of photos.
+
+    skipped: how many files of the folder are no photos, by suffix, as text for people.
+    """
 
     path: Path
     sources: tuple[Source, ...]
     scene: Capture | None
+    skipped: str = ""
 
     @property
     def kind(self) -> str:
@@ -90,7 +94,8 @@ def find_subject(path: Path, *, subfolders: bool = False) -> ExaminedCapture:
     photos = [*list_photos(path, subfolders=subfolders), *list_unreadable(path, subfolders=subfolders)]
     if not photos:
         raise UserError(f"no photos and no scene in {path}", where_photos_may_be(path))
-    return ExaminedCapture(path, tuple(Source(name_in(path, photo), photo) for photo in photos), None)
+    sources = tuple(Source(name_in(path, photo), photo) for photo in photos)
+    return ExaminedCapture(path, sources, None, skipped_files(path, subfolders=subfolders))
 
 
 def estimated_seconds(count: int, threads: int) -> float:
@@ -126,7 +131,7 @@ def examine(
 
     facts, unreadable = read_all(subject.sources, threads=threads, progress=on_photo)
     if not facts:
-        findings = [inventory.readable(unreadable, 0), inventory.enough(0)]
+        findings = [inventory.readable(unreadable, (), subject.skipped), inventory.enough(0)]
         nothing = np.zeros(0)
         return Diagnosis(subject, tuple(findings), (("all else", "no readable photo"),), (), nothing, nothing, ())
     places = choose_pairs(facts)
@@ -191,7 +196,7 @@ def judged(
     missing = checks.run("lacking detail", lambda: quality.lacking_detail(photos, pairs), otherwise=unknown)
     brighter, redder = checks.run("stops", lambda: quality.stops(photos, pairs), otherwise=(unknown, unknown))
     planned: list[tuple[str, Callable[[], Finding | None]]] = [
-        ("readable photos", lambda: inventory.readable(unreadable, len(photos))),
+        ("readable photos", lambda: inventory.readable(unreadable, photos, subject.skipped)),
         ("number of photos", lambda: inventory.enough(len(photos))),
         ("size", lambda: inventory.size(photos)),
         ("cameras", lambda: inventory.cameras(photos)),

@@ -24,14 +24,16 @@ _SAME_PICTURE = 0.999
 _SAME_PIXELS = 0.0003
 
 
-def readable(unreadable: Mapping[str, str], count: int) -> Finding:
-    """Check whether all files can be read; `count` is the number of readable ones."""
-    bad = len(unreadable)
-    total = max(bad + count, 1)
+def readable(unreadable: Mapping[str, str], photos: Sequence[PhotoFacts], skipped: str = "") -> Finding:
+    """Check whether all files can be read; `skipped` counts those that are no photos, as text."""
+    bad, total = len(unreadable), len(unreadable) + len(photos)
+    paged = [photo.name for photo in photos if photo.exif.pages > 1]
+    notes = f"; no photos: {skipped}" if skipped else ""
+    notes += f"; the largest page is used of {several(len(paged), 'file')}, such as {paged[0]}" if paged else ""
     threshold = "look from 1, bad from 10 % of the photos"
     if not bad:
-        return Finding("files", GOOD, f"all {several(count, 'photo')} can be read", 0, threshold)
-    summary, verdict = f"{bad} of {several(total, 'photo')} cannot be read", BAD if bad >= 0.1 * total else LOOK
+        return Finding("files", GOOD, f"all {several(total, 'photo')} can be read{notes}", 0, threshold)
+    summary, verdict = f"{bad} of {several(total, 'photo')} cannot be read{notes}", BAD if bad >= 0.1 * total else LOOK
     advice = "convert these files to JPEG, copy them again, or remove them"
     return Finding("files", verdict, summary, bad, threshold, advice, tuple(unreadable.items()))
 

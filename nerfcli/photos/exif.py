@@ -12,7 +12,7 @@ import numpy as np
 from PIL import ExifTags
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.photos.images import exif_entries, opened, orientation_of, upright_size
+from nerfcli.photos.images import exif_entries, number_of_pages, opened, orientation_of, upright_size
 
 # Values of EXIF's FocalPlaneResolutionUnit; 4 and 5 are not standard, but some cameras write them.
 _RESOLUTION_UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
@@ -27,7 +27,7 @@ class Exif:
     or None), north and east positive. taken is the time of the shot in seconds of the camera's own clock, comparable
     between photos of one camera. taken_px is the (width, height) that EXIF records for the picture, as the camera
     stored it; sensor_px_per_mm is the number of its pixels per millimetre of the sensor. digital_zoom is 1 or more, see
-    `focal_evidence.with_digital_zoom`.
+    `focal_evidence.with_digital_zoom`. pages: of the file, of which the largest is the photo.
     """
 
     make: str | None
@@ -46,6 +46,7 @@ class Exif:
     taken_px: tuple[int, int] | None = None
     sensor_px_per_mm: float | None = None
     digital_zoom: float | None = None
+    pages: int = 1
 
 
 def read_exif(path: Path) -> Exif:
@@ -59,7 +60,7 @@ def read_exif(path: Path) -> Exif:
         main = exif_entries(image, None)
         camera = exif_entries(image, ExifTags.IFD.Exif)
         gps = exif_entries(image, ExifTags.IFD.GPSInfo)
-        orientation = orientation_of(image)
+        orientation, pages = orientation_of(image), number_of_pages(image)
     return Exif(
         make=_text(main.get(ExifTags.Base.Make)),
         model=_text(main.get(ExifTags.Base.Model)),
@@ -77,6 +78,7 @@ def read_exif(path: Path) -> Exif:
         taken_px=_recorded_size(camera),
         sensor_px_per_mm=_sensor_resolution(camera),
         digital_zoom=_zoom(camera.get(ExifTags.Base.DigitalZoomRatio)),
+        pages=pages,
     )
 
 

@@ -7,6 +7,7 @@ import io
 import struct
 import warnings
 import zlib
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,14 +16,20 @@ from typing import Any
 import cv2
 import numpy as np
 import pi_heif
-from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageCms, TiffImagePlugin, UnidentifiedImageError
 from PIL.PngImagePlugin import PngInfo
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
 
 HEIC_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}) | HEIC_SUFFIXES
+# What every program reads; beside such a picture, one of the same name in another format is the same photo, converted.
+_USUAL_SUFFIXES = frozenset({".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".webp", ".bmp"})
+_JPEG_2000_SUFFIXES = frozenset({".jp2", ".j2k", ".jpx", ".jpf", ".jpc", ".j2c"})
+_NETPBM_SUFFIXES = frozenset({".ppm", ".pgm", ".pbm", ".pnm"})
+# Which other programs often cannot read.
+UNUSUAL_SUFFIXES = HEIC_SUFFIXES | _JPEG_2000_SUFFIXES | _NETPBM_SUFFIXES | {".avif", ".gif", ".mpo", ".tga"}
+IMAGE_SUFFIXES = _USUAL_SUFFIXES | UNUSUAL_SUFFIXES
 
 # Pillow now opens HEIC, too: upright, as the file itself says, and with an EXIF orientation of 1.
 pi_heif.register_heif_opener()
@@ -44,22 +51,36 @@ _DAMAGED = (
     *(OSError, EOFError, SyntaxError, ValueError, TypeError, LookupError, RuntimeError),
     *(struct.error, zlib.error, Image.DecompressionBombError),
 )
+_OR_REMOVE = "or remove it from the folder"
 _DAMAGED_HINT = "copy the photo again, or remove it from the folder"
-_FORMATS = "JPEG, HEIC, PNG, TIFF, WebP or BMP"
+_FORMATS = "JPEG, HEIC, AVIF, JPEG 2000, PNG, TIFF, WebP, BMP, GIF, TGA or PNM"
 _SRGB = ImageCms.createProfile("sRGB")
 # Two colour spaces that agree within this many of 255 levels on a grid of colours count as the same.
 _SAME_COLOUR_LEVELS = 2
 # zlib level, and PNG's filter "up": files are 9 % larger than with a filter chosen per line, but take half the time.
 _PNG_LEVEL, _PNG_UP = 4, 2
 _PNG_COLOURS = {1: 0, 3: 2, 4: 6}  # PNG's colour types by number of channels
-# Formats of phones and cameras that are not read.
-_UNSUPPORTED_SUFFIXES = frozenset({".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"})
+# Photos that are not read, by suffix, and why.
+_RAW = "is a raw file: develop it to JPEG or 16-bit TIFF"
+_FLOAT = "has float pixels, whose white level is unknown: save it with 8 or 16 bits per channel"
+_UNREAD = {
+    **dict.fromkeys((".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".raf", ".orf"), _RAW),
+    **dict.fromkeys((".rw2", ".pef", ".srw", ".x3f", ".3fr", ".iiq", ".rwl", ".gpr"), _RAW),
+    **dict.fromkeys((".exr", ".hdr", ".pfm"), _FLOAT),
+    ".jxl": "is a JPEG XL file: convert it to JPEG",
+    ".insp": "holds the two circles of a 360-degree camera: export it as one equirectangular picture",
+}
+# Files in a folder of photos that are nobody's photos: our list of a video's frames, and what systems leave behind.
+_OURS_OR_SYSTEM = frozenset({"frames.json", "Thumbs.db", "desktop.ini"})
+# The tag of a TIFF that says what its samples are, and its value for float.
+_SAMPLE_FORMAT, _FLOAT_SAMPLES = 339, 3
 
 
 def list_images(folder: Path) -> list[Path]:
     """Return the picture files directly in a folder, sorted by name; hidden files and subfolders are left out.
 
-    A HEIC file is left out if a picture with its name in another format is beside it: the same photo, converted.
+    A picture in an unusual format, such as HEIC, is left out if one of the same name in a usual format is beside it:
+    the same photo, converted.
 
     Raises:
         UserError: the folder does not exist or cannot be listed.
@@ -70,8 +91,8 @@ def list_images(folder: Path) -> list[Path]:
         reason = error.strerror or str(error)
         raise UserError(f"cannot list the photos in {folder}: {reason}", "give a folder of photos") from error
     pictures = [path for path in files if not path.name.startswith(".") and path.is_file()]
-    others = {path.stem for path in pictures if path.suffix.lower() not in HEIC_SUFFIXES}
-    kept = (path for path in pictures if path.suffix.lower() not in HEIC_SUFFIXES or path.stem not in others)
+    usual = {path.stem for path in pictures if path.suffix.lower() in _USUAL_SUFFIXES}
+    kept = (path for path in pictures if path.suffix.lower() in _USUAL_SUFFIXES or path.stem not in usual)
     return sorted(kept, key=lambda path: path.name)
 
 
@@ -89,7 +110,8 @@ def read_image(path: Path) -> np.ndarray:
     """Read a picture as upright 8-bit sRGB.
 
     Grey, palette, CMYK and 16-bit pixels (the high byte is kept) are converted to 8-bit RGB. Colours with an embedded
-    profile other than sRGB are converted; a profile that cannot be used is ignored.
+    profile other than sRGB are converted; a profile that cannot be used is ignored. Of a TIFF file with several pages
+    the largest is read, of other files with several pictures the first.
 
     Returns:
         uint8, writable: (height, width, 3) RGB, or (height, width, 4) RGBA with straight alpha if the file
@@ -189,6 +211,8 @@ def _check_pixels(image: np.ndarray) -> None:
 @contextmanager
 def opened(path: Path) -> Iterator[Image.Image]:
     """Open a file as a lazy Pillow image; errors of the file inside the block become a UserError."""
+    if path.suffix.lower() in _UNREAD:
+        raise UserError(f"{path} {_UNREAD[path.suffix.lower()]}", _OR_REMOVE)
     try:
         if path.stat().st_size == 0:
             raise UserError(f"{path} is empty (0 bytes)", "copy the photo again, or remove the file")
@@ -196,8 +220,12 @@ def opened(path: Path) -> Iterator[Image.Image]:
             # Pillow warns about odd metadata and palettes; none of it changes the pixels.
             warnings.filterwarnings("ignore", module=r"PIL\.")
             with Image.open(path) as image:
+                if number_of_pages(image) > 1:
+                    image.seek(_largest_page(image))
                 yield image
     except UnidentifiedImageError as error:
+        if _has_float_samples(path):
+            raise UserError(f"{path} {_FLOAT}", _OR_REMOVE) from error
         if path.suffix.lower() in HEIC_SUFFIXES and pi_heif.is_supported(path):  # it begins like one
             raise UserError(f"{path} is damaged or truncated", _DAMAGED_HINT) from error
         raise UserError(
@@ -205,17 +233,45 @@ def opened(path: Path) -> Iterator[Image.Image]:
             f"supported are {_FORMATS}; convert it (raw files, too), or remove it from the folder",
         ) from error
     except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
+        if path.is_symlink() and not path.exists():
+            raise UserError(f"{path} is a link to a file that does not exist", "copy the photo again") from error
         raise UserError(f"cannot read {path}: {error.strerror}", f"expected a {_FORMATS} file") from error
     except _DAMAGED as error:
         raise UserError(f"{path} is damaged or truncated: {error}", _DAMAGED_HINT) from error
+
+
+def number_of_pages(image: Image.Image) -> int:
+    """Return how many pages an opened TIFF has; 1 for other formats, where further pictures are not other photos."""
+    return getattr(image, "n_frames", 1) if image.format == "TIFF" else 1
+
+
+def _largest_page(image: Image.Image) -> int:
+    """Return the number of the largest page of an opened TIFF, the first of equals: scanners store previews first."""
+    pixels = []
+    for page in range(number_of_pages(image)):
+        image.seek(page)
+        pixels.append(image.width * image.height)
+    return pixels.index(max(pixels))
+
+
+def _has_float_samples(path: Path) -> bool:
+    """Return whether a file is a TIFF with float pixels, which Pillow opens only if they are grey."""
+    try:
+        with warnings.catch_warnings(action="ignore"), path.open("rb") as file:
+            tags = TiffImagePlugin.ImageFileDirectory_v2(file.read(8))
+            file.seek(tags.next)
+            tags.load(file)
+            return _FLOAT_SAMPLES in tags.get(_SAMPLE_FORMAT, ())
+    except _DAMAGED:
+        return False
 
 
 def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
     """Return a loaded image in mode RGB or RGBA, in the sRGB colour space."""
     profile = image.info.get("icc_profile")
     mode = "RGBA" if image.has_transparency_data else "RGB"
-    # A 16-bit PNG is "I" in older releases of Pillow.
-    if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):
+    # A 16-bit PNG is "I" in older releases of Pillow, and a 16-bit PGM in all.
+    if image.mode.startswith("I;16") or (image.mode == "I" and image.format in ("PNG", "PPM")):
         # Keep the high byte, as Pillow does for 16-bit colour; this is exact for 8-bit pixels that were widened to 16.
         image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
     if image.mode in ("I", "F"):
@@ -285,12 +341,26 @@ def list_photos(folder: Path, *, subfolders: bool = False) -> list[Path]:
 
 
 def list_unreadable(folder: Path, *, subfolders: bool = False) -> list[Path]:
-    """Return photos in formats that cannot be read (raw, JPEG XL), and broken links, as `list_photos` does.
+    """Return photos in formats that cannot be read (raw, JPEG XL...), and broken links, as `list_photos` does.
 
     A file is left out if a readable picture of the same name, apart from the suffix, is beside it.
     """
     paths = [path for each in _folders(folder, subfolders=subfolders) for path in _unreadable(each)]
     return sorted(paths, key=lambda path: name_in(folder, path))
+
+
+def skipped_files(folder: Path, *, subfolders: bool = False) -> str:
+    """Count the files that are no photos by their suffix, such as "2 .mov, 1 .txt"; "" without any.
+
+    Pictures in an unusual format beside the same photo in a usual one count, too.
+    """
+    counts = Counter[str]()
+    for each in _folders(folder, subfolders=subfolders):
+        used = {*list_images(each), *_unreadable(each)}
+        files = (path for path in each.iterdir() if path not in used and path.is_file())
+        names = (path for path in files if not path.name.startswith(".") and path.name not in _OURS_OR_SYSTEM)
+        counts.update(path.suffix.lower() or "without a suffix" for path in names)
+    return ", ".join(f"{count} {suffix}" for suffix, count in counts.most_common())
 
 
 def name_in(folder: Path, path: Path) -> str:
@@ -306,7 +376,9 @@ def where_photos_may_be(folder: Path) -> str:
     if with_photos:
         more = f" and {len(with_photos) - 1} more folders" if len(with_photos) > 2 else f" and {with_photos[1]}"
         return f"there are photos in {with_photos[0]}{more}; give one of them, or use all with --subfolders"
-    return f"expected files ending in {', '.join(sorted(IMAGE_SUFFIXES))}"
+    skipped = skipped_files(folder)
+    there = f"there are only {skipped}; " if skipped else ""
+    return f"{there}expected files ending in {', '.join(sorted(IMAGE_SUFFIXES))}"
 
 
 def _folders(folder: Path, *, subfolders: bool) -> list[Path]:
@@ -327,4 +399,4 @@ def _unreadable(folder: Path) -> list[Path]:
     read = {path.stem for path in list_images(folder)}
     files = [path for path in folder.iterdir() if not path.name.startswith(".") and path.stem not in read]
     broken = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES and not path.exists()]
-    return [*(path for path in files if path.suffix.lower() in _UNSUPPORTED_SUFFIXES), *broken]
+    return [*(path for path in files if path.suffix.lower() in _UNREAD), *broken]

@@ -13,14 +13,15 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import IO, Generic, TypeVar
 
 import imageio_ffmpeg
 import numpy as np
 
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, in_shell
 from nerfcli.photos.images import IMAGE_SUFFIXES
 
 T = TypeVar("T")
@@ -34,6 +35,27 @@ _TIME = re.compile(r" pts_time:(\S+)")
 # Inputs that ffmpeg would decode although they are not videos: text as screen art, photos, lists of other files.
 _NO_VIDEO = re.compile(r"Input #0, (tty|image2|concat|hls|dash|sdp|ico|\w+_pipe)\b")
 _HDR = re.compile(r"smpte2084|arib-std-b67")
+_STREAM = re.compile(r"Stream #0:(\d+)\D.* Video: .*?, (\d+)x(\d+)")
+_COVER = re.compile(r"\((attached pic|timed thumbnails|still image)\)")
+# HDR video to sRGB: its reference white, paper at 203 cd/m2 (ITU-R BT.2408), becomes white, and brighter light is
+# compressed from 0.7 of white on.
+_SRGB_FROM_HDR = (
+    "zscale=transfer=linear:npl=203:primariesin=bt2020:matrixin=bt2020nc,format=gbrpf32le,zscale=primaries=bt709,"
+    "tonemap=mobius:param=0.7,zscale=transfer=iec61966-2-1:matrix=gbr:range=full,format=gbrp,"
+)
+# What ffmpeg says of a stream whose frames hold two fields, the lines of which were filmed one after the other.
+_INTERLACED = re.compile(r"(top|bottom) (coded )?first")
+# idet's count of frames by what it sees in them. If one kind is this many times the other, that counts, not the header.
+_FIELDS = re.compile(r"Multi frame detection: TFF:\s*(\d+) BFF:\s*(\d+) Progressive:\s*(\d+)")
+_CLEARLY, _FEWEST_SEEN = 4, 10
+# Files of 360-degree cameras.
+_UNREAD = {
+    ".insv": (
+        "holds the circles of two lenses of a 360-degree camera",
+        "export it as an equirectangular MP4 with the program of the camera's maker, and give that",
+    ),
+    ".lrv": ("is a camera's small preview of another video", "give that video, which is beside it on the card"),
+}
 # Numbers of channels of PGM and PPM, picture formats that state their own size.
 _CHANNELS = {b"P5": 1, b"P6": 3}
 _LINES_KEPT = 60
@@ -45,7 +67,9 @@ class Video:
     """Header of a video.
 
     width and height are those of its frames, upright and with square pixels. seconds (stated duration) and fps (stated
-    mean frame rate) are NaN where nothing is stated. hdr: the colours are stored for HDR screens (PQ or HLG).
+    mean frame rate) are NaN where nothing is stated. hdr: the colours are stored for HDR screens (PQ or HLG). stream:
+    its number in the file, of num_streams with a video. fields: the parity of a video whose frames hold two fields, as
+    ffmpeg's bwdif takes it; "" for whole frames.
     """
 
     path: Path
@@ -54,15 +78,32 @@ class Video:
     seconds: float
     fps: float
     hdr: bool
+    stream: int
+    num_streams: int
+    fields: str
+
+    @property
+    def _whole_frames(self) -> str:
+        """The filter that interpolates each frame's lines of the later field."""
+        return f"bwdif=mode=send_frame:parity={self.fields}," if self.fields else ""
+
+    @property
+    def _upright(self) -> str:
+        """The filters from a decoded frame to upright sRGB with square pixels."""
+        return f"{self._whole_frames}{_SRGB_FROM_HDR if self.hdr else ''}{_UPRIGHT}"
 
 
 @dataclass(frozen=True)
 class MeasuredFrames(Generic[T]):
-    """The measured value of each frame, its time since the first one, (frames,), and the number of decoding errors."""
+    """The measured value of each frame, its time since the first one, (frames,), and the number of decoding errors.
+
+    fields: as of the video, but by what most frames show, if that is clear: headers are often wrong.
+    """
 
     seconds: np.ndarray
     values: list[T]
     errors: int
+    fields: str
 
 
 def ffmpeg_program(purpose: str, *, instead: str = "") -> str:
@@ -92,29 +133,74 @@ def open_video(path: Path) -> Video:
     """
     if not path.is_file():
         raise UserError(f"{path} does not exist", "give a video file, or a folder of photos")
-    if path.suffix.lower() in IMAGE_SUFFIXES:
+    suffix = path.suffix.lower()
+    if suffix in _UNREAD:
+        what, hint = _UNREAD[suffix]
+        raise UserError(f"{path} {what}", hint)
+    if suffix in IMAGE_SUFFIXES - {".gif"}:
         raise UserError(f"{path} is a single photo", f"give the folder of the photos: {path.parent}")
     if path.stat().st_size == 0:
         raise UserError(f"{path} is empty (0 bytes)", "copy the video again")
-    with _decoding(path, _UPRIGHT, "ppm", more=("-frames:v", "1")) as decoder:
-        first = next(decoder.frames(), None)
-        decoder.finish()
+    first, decoder = _first_frame(path, "0:V:0", _UPRIGHT)
     head = "\n".join(decoder.head)
     if _NO_VIDEO.search(head) or "matches no streams" in decoder.last_errors:
         raise UserError(f"{path} contains no video stream", "give a video file, or a folder of photos")
     if first is None:
         raise _unreadable(path, decoder)
-    stream = next((line for line in decoder.head if re.search(r"Stream #0:.* Video: ", line)), "")
     duration = re.search(r"Duration: (\d+):(\d+):([\d.]+)", head)
-    fps = re.search(r"([\d.]+) fps", stream)
-    return Video(
-        path=path,
-        width=first.shape[1],
-        height=first.shape[0],
-        seconds=int(duration[1]) * 3600 + int(duration[2]) * 60 + float(duration[3]) if duration else math.nan,
+    seconds = int(duration[1]) * 3600 + int(duration[2]) * 60 + float(duration[3]) if duration else math.nan
+    stream, line, num_streams = _largest_stream(path, decoder.head)
+    fps = re.search(r"([\d.]+) fps", line)
+    video = Video(
+        path,
+        *first.shape[1::-1],
+        seconds=seconds,
         fps=float(fps[1]) if fps else math.nan,
-        hdr=bool(_HDR.search(stream)),
+        hdr=bool(_HDR.search(line)),
+        stream=stream,
+        num_streams=num_streams,
+        fields="auto" if _INTERLACED.search(line) else "",
     )
+    if num_streams > 1 or video.hdr:
+        first, decoder = _first_frame(path, f"0:{stream}", video._upright)
+        if "No such filter" in decoder.last_errors:
+            raise UserError(
+                f"{path} is an HDR video, and this ffmpeg cannot convert its colours: {decoder.last_errors}",
+                f"unset IMAGEIO_FFMPEG_EXE to use the ffmpeg that came with nerfcli, or {ANOTHER_FFMPEG}",
+            )
+        if first is None:
+            raise _unreadable(path, decoder)
+        video = replace(video, width=first.shape[1], height=first.shape[0])
+    return video
+
+
+def _first_frame(path: Path, stream: str, filters: str) -> "tuple[np.ndarray | None, _Decoder]":
+    with _decoding(path, filters, "ppm", stream=stream, more=("-frames:v", "1")) as decoder:
+        first = next(decoder.frames(), None)
+        decoder.finish()
+    return first, decoder
+
+
+def _largest_stream(path: Path, head: Sequence[str]) -> tuple[int, str, int]:
+    """Return the number of the video stream with most pixels, ffmpeg's line on it, and the number of such streams.
+
+    Raises:
+        UserError: several are equally large, such as those of two lenses.
+    """
+    inputs = takewhile(lambda line: "Output #0" not in line, head)
+    found = [(line, match) for line in inputs if (match := _STREAM.search(line)) and not _COVER.search(line)]
+    if not found:
+        return 0, "", 1
+    pixels = [int(match[2]) * int(match[3]) for _, match in found]
+    line, match = found[pixels.index(max(pixels))]
+    if pixels.count(max(pixels)) > 1:
+        one = path.with_name(f"{path.stem}-1.mp4")
+        raise UserError(
+            f"{path} has {pixels.count(max(pixels))} video streams of {match[2]}x{match[3]} pixels, such as the lenses "
+            "of one camera",
+            f"save the one to use as a file: ffmpeg -i {in_shell(path)} -map 0:{match[1]} -c copy {in_shell(one)}",
+        )
+    return int(match[1]), line, len(found)
 
 
 def measure_frames(
@@ -132,7 +218,8 @@ def measure_frames(
     factor = max(1.0, max(video.width, video.height) / longer_side)
     size = f"{max(1, round(video.width / factor))}:{max(1, round(video.height / factor))}"
     values: list[T] = []
-    with _decoding(video.path, f"showinfo=checksum=0,scale={size}:flags=area,format=gray", "pgm") as decoder:
+    filters = f"idet,{video._whole_frames}showinfo=checksum=0,scale={size}:flags=area,format=gray"
+    with _decoding(video.path, filters, "pgm", stream=f"0:{video.stream}") as decoder:
         for frame in decoder.frames():
             values.append(measure(frame))
             if video.seconds * video.fps > 0:
@@ -142,7 +229,18 @@ def measure_frames(
         raise _cut_short(video, decoder)
     if not values or decoder.returncode != 0:
         raise _unreadable(video.path, decoder)
-    return MeasuredFrames(_times(decoder.times, len(values), video.fps), values, decoder.errors)
+    times = _times(decoder.times, len(values), video.fps)
+    return MeasuredFrames(times, values, decoder.errors, _shown_fields(decoder.counts, video.fields))
+
+
+def _shown_fields(counts: tuple[int, int, int], stated: str) -> str:
+    """Return the fields of a video by idet's counts of frames: top field first, bottom field first, whole."""
+    top, bottom, whole = counts
+    if max(top + bottom, whole) < max(_FEWEST_SEEN, _CLEARLY * min(top + bottom, whole)):
+        return stated
+    if whole > top + bottom:
+        return ""
+    return stated or ("tff" if top > bottom else "bff")
 
 
 def read_frames(video: Video, numbers: Sequence[int]) -> Iterator[np.ndarray]:
@@ -158,7 +256,9 @@ def read_frames(video: Video, numbers: Sequence[int]) -> Iterator[np.ndarray]:
         UserError: a frame is missing, as the video has changed since it was measured.
     """
     given = 0
-    with _decoding(video.path, f"select='{_one_of(numbers)}',{_UPRIGHT}", "ppm") as decoder:
+    # The fields of a frame are interpolated with those of its neighbours, so before the choice.
+    filters = f"{video._whole_frames}select='{_one_of(numbers)}',{_SRGB_FROM_HDR if video.hdr else ''}{_UPRIGHT}"
+    with _decoding(video.path, filters, "ppm", stream=f"0:{video.stream}") as decoder:
         for frame in decoder.frames():
             given += 1
             yield frame
@@ -171,13 +271,15 @@ class _Decoder:
     """A running ffmpeg: its pictures come from stdout, and a separate thread sorts its messages on stderr.
 
     Of a possibly endless log only this is kept: the first lines (head), the last errors, their number (errors), the
-    seconds that showinfo prints (times), and whether the file is truncated (cut_short).
+    seconds that showinfo prints (times), idet's counts of frames by their fields (counts), and whether the file is
+    truncated (cut_short).
     """
 
     def __init__(self, process: "subprocess.Popen[bytes]"):
         self._process = process
         self.head: list[str] = []
         self.times: list[str] = []
+        self.counts = (0, 0, 0)
         self.errors = 0
         self.cut_short = False
         self._last_errors: deque[str] = deque(maxlen=_LINES_KEPT)
@@ -213,6 +315,8 @@ class _Decoder:
             if time := _TIME.search(line):
                 self.times.append(time[1])
                 continue
+            if counts := _FIELDS.search(line):
+                self.counts = (int(counts[1]), int(counts[2]), int(counts[3]))
             if len(self.head) < _LINES_KEPT:
                 self.head.append(line)
             if error := _ERROR.search(line):
@@ -221,12 +325,12 @@ class _Decoder:
 
 
 @contextmanager
-def _decoding(path: Path, filters: str, codec: str, *, more: Sequence[str] = ()) -> Iterator[_Decoder]:
-    """Run ffmpeg on the first video stream, without covers and thumbnails; it is killed when the block ends."""
+def _decoding(path: Path, filters: str, codec: str, *, stream: str, more: Sequence[str] = ()) -> Iterator[_Decoder]:
+    """Run ffmpeg on a stream, "0:V:0" for the first that is no cover or thumbnail; it is killed when the block ends."""
     command = [
         *(ffmpeg_program(f"cannot read {path}"), "-hide_banner", "-nostats", "-nostdin", "-loglevel", "level+info"),
         # "file:", because a colon in a name would be read as a protocol. The whitelist keeps inputs on this machine.
-        *("-protocol_whitelist", "file,pipe", "-i", f"file:{path}", "-map", "0:V:0"),
+        *("-protocol_whitelist", "file,pipe", "-i", f"file:{path}", "-map", stream),
         # Pass each frame exactly once: otherwise ffmpeg repeats and drops frames to make the rate constant.
         *("-fps_mode", "passthrough", "-vf", filters, *more, "-c:v", codec, "-f", "image2pipe", "-"),
     ]

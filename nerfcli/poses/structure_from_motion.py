@@ -15,7 +15,7 @@ from nerfcli.atomic import write_json
 from nerfcli.captures.calibration import Calibration
 from nerfcli.captures.formats import scene_folder
 from nerfcli.captures.holdout import names_held_out
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, several
 from nerfcli.poses.engine.strict import move_held_out_last
 from nerfcli.poses.engine.supervise import WorkerDiedError, run_worker
 from nerfcli.poses.engine.turntable import MASKS, add_advice
@@ -127,8 +127,15 @@ def _search_settings(settings: PoseSettings, grouped: PhotoGroups) -> PoseSettin
 
 
 def photo_notes(photos: Photos, grouped: PhotoGroups) -> list[str]:
-    """List the skipped files with reasons, and notes on the cameras of the other photos."""
-    return [*(f"{name} is skipped: {why}" for name, why in photos.unreadable.items()), *grouped.notes]
+    """List the skipped files with reasons, and notes on the pages and cameras of the other photos."""
+    notes = [f"{name} is skipped: {why}" for name, why in photos.unreadable.items()]
+    if photos.skipped:
+        notes.append(f"files that are no photos: {photos.skipped}")
+    paged = [photo for photo in photos.photos if photo.exif.pages > 1]
+    if paged:
+        first = f"{paged[0].name}, {paged[0].width}x{paged[0].height}"
+        notes.append(f"{several(len(paged), 'file')} with several pages: the largest is used, such as {first}")
+    return [*notes, *grouped.notes]
 
 
 def _run(

@@ -15,7 +15,7 @@ from nerfcli.captures.stored_pixels import STORED, in_pixels, other_sizes
 from nerfcli.captures.world_frame import WorldFrame, in_world_frame
 from nerfcli.errors import UserError, listed, several
 from nerfcli.notices import Reporter
-from nerfcli.photos.images import HEIC_SUFFIXES
+from nerfcli.photos.images import UNUSUAL_SUFFIXES
 from nerfcli.poses.input.video_frames import extract_frames, frames_folder
 
 
@@ -66,10 +66,9 @@ def convert_capture(
     done = convert(moved.capture, target, source_format=form.name, wanted=wanted)
     for text in done.notes:
         reporter.note(text)
-    if to != "nerfcli" and any(
-        f.image is not None and f.image.suffix.lower() in HEIC_SUFFIXES for f in done.capture.frames
-    ):
-        reporter.note("the photos are HEIC, which many other programs cannot read")
+    suffixes = {frame.image.suffix.lower() for frame in done.capture.frames if frame.image is not None}
+    if to != "nerfcli" and (unusual := sorted(suffixes & UNUSUAL_SUFFIXES)):
+        reporter.note(f"the photos are {', '.join(unusual)} files, which many other programs cannot read")
     for loss in done.losses:
         reporter.warn(f"{to} cannot hold {loss}")
     if done.loss_px > TOLERANCE_PX:

@@ -8,7 +8,14 @@ from pathlib import Path, PurePosixPath
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError, several
 from nerfcli.photos.exif import Exif, read_exif
 from nerfcli.photos.focal_evidence import focal_evidence, same_focal, with_digital_zoom
-from nerfcli.photos.images import list_photos, list_unreadable, name_in, read_image, where_photos_may_be
+from nerfcli.photos.images import (
+    list_photos,
+    list_unreadable,
+    name_in,
+    read_image,
+    skipped_files,
+    where_photos_may_be,
+)
 from nerfcli.photos.panoramas import is_panorama
 
 # Three views determine a scene up to scale, but leave nothing to check them with; four are the fewest that do.
@@ -32,11 +39,15 @@ class Photo:
 
 @dataclass(frozen=True)
 class Photos:
-    """The photos of a folder, sorted by name, and why each of the others could not be read (by name)."""
+    """The photos of a folder, sorted by name, and why each of the others could not be read (by name).
+
+    skipped: how many files are no photos, by suffix, as text for people.
+    """
 
     folder: Path
     photos: tuple[Photo, ...]
     unreadable: dict[str, str]
+    skipped: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -58,17 +69,11 @@ def find_photos(
         raise UserError(f"the folder {folder} does not exist", "give a folder of photos, or a video file")
     if not folder.is_dir():
         raise UserError(f"{folder} is a file, not a folder of photos", "give the folder that contains the photos")
-    paths = list_photos(folder, subfolders=subfolders)
-    hopeless = list_unreadable(folder, subfolders=subfolders)
-    if not paths and not hopeless:
+    paths = [*list_photos(folder, subfolders=subfolders), *list_unreadable(folder, subfolders=subfolders)]
+    if not paths:
         raise UserError(f"no photos in {folder}", where_photos_may_be(folder))
     photos: list[Photo] = []
-    unreadable = {
-        name_in(folder, path): f"{path.suffix} files are not supported; convert them to JPEG"
-        if path.exists()
-        else "a link to a file that does not exist"
-        for path in hopeless
-    }
+    unreadable: dict[str, str] = {}
     with ThreadPoolExecutor(4) as readers:  # each holds a decoded photo in memory
         for index, found in enumerate(readers.map(lambda path: _examine(path, name_in(folder, path)), paths)):
             if isinstance(found, Photo):
@@ -81,7 +86,7 @@ def find_photos(
         raise _too_few(folder, photos, unreadable)
     exifs = with_digital_zoom([photo.exif for photo in photos])
     zoomed = tuple(replace(photo, exif=exif) for photo, exif in zip(photos, exifs, strict=True))
-    return Photos(folder=folder, photos=zoomed, unreadable=unreadable)
+    return Photos(folder, zoomed, unreadable, skipped_files(folder, subfolders=subfolders))
 
 
 def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:

@@ -9,7 +9,7 @@ capture; frames.json has their origin.
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -181,16 +181,14 @@ def extract_frames(
     request = {"video": _identity(path), "frames": count, "selection": 1}
     if _kept(folder, path, request, overwrite=overwrite, notify=notify):
         return
+    if video.num_streams > 1:
+        notify(f"{path.name} has {video.num_streams} video streams: the largest, {video.width}x{video.height}, is used")
     if video.hdr:
-        notify(f"{path.name} is HDR; its colours are used as stored, which looks pale")
-    meter = FrameMeter()
+        notify(f"{path.name} is an HDR video: its colours are converted to sRGB")
     # Measuring takes most of the time, since it also examines every frame; extracting only decodes.
-    measured = measure_frames(
-        video,
-        meter.measure,
-        longer_side=SHARPNESS_SIZE_PX,
-        progress=lambda fraction: progress(0.7 * fraction, "looking for sharp frames"),
-    )
+    video, measured = _measured(video, lambda fraction: progress(0.7 * fraction, "looking for sharp frames"))
+    if video.fields:
+        notify(f"{path.name} is interlaced: the lines of the later field of each frame are interpolated")
     if measured.errors:
         notify(f"{path.name} is damaged in {measured.errors} places; nearby frames may show block artifacts")
     total = len(measured.values)
@@ -232,6 +230,14 @@ def extract_frames(
         f"{folder}: {len(frames)} of {total} frames of {path.name}"
         + (f"; {same} more are duplicates of the previous frame" if same else "")
     )
+
+
+def _measured(video: Video, progress: Callable[[float], None]) -> tuple[Video, MeasuredFrames[FrameMeasure]]:
+    """Measure all frames; once more if they show that the video's header is wrong about interlacing."""
+    measured = measure_frames(video, FrameMeter().measure, longer_side=SHARPNESS_SIZE_PX, progress=progress)
+    if measured.fields == video.fields:
+        return video, measured
+    return _measured(replace(video, fields=measured.fields), progress)
 
 
 def _write(
