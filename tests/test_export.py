@@ -177,10 +177,10 @@ def test_previews_share_one_range_over_all_frames(model, tmp_path):
     frames = [frame("near", 1.0), frame("far", 3.0)]
     export(model, frames, tmp_path / "views", outputs=("depth",))
     depths = [read_tiff(tmp_path / f"views/depth/{name}.tiff") for name in ("near", "far")]
-    lo, hi = value_range(lambda: iter([depth for depth, _ in depths]), "depth")
-    assert hi - lo > 1.5
+    colours = value_range(lambda: iter([depth for depth, _ in depths]), "depth")
+    assert colours.high - colours.low > 1.5
     for name, (depth, meta) in zip(("near", "far"), depths, strict=True):
-        expected = preview(depth, meta, lo=lo, hi=hi)
+        expected = preview(depth, meta, colours)
         np.testing.assert_array_equal(read_image(tmp_path / f"views/depth/{name}.png"), expected)
 
 

@@ -109,8 +109,8 @@ def test_views_hold_the_photo_and_what_the_field_shows_of_it(seen):
     assert view.metrics.psnr == pytest.approx(-10 * np.log10(np.square(difference).mean()), abs=1e-9)
     assert 0.0 < view.with_depth < 1.0
     assert view.with_depth == np.isfinite(view.depth).mean()
-    low, high = depth_range(look)
-    assert 1.5 <= low < high <= 2.5  # between the cube's front and back
+    colours = depth_range(look)
+    assert 1.5 <= colours.low < colours.high <= 2.5  # between the cube's front and back
     # The training photo from the same side sees the surface, the one from behind does not.
     np.testing.assert_array_equal(view.coverage[3:5, 4:6], 1.0)
     assert np.isnan(view.coverage[0, 0])
@@ -236,13 +236,13 @@ def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
     assert text.index("differs: settings.log2_rows") < text.index(">settings.seed<")
     assert "another: rendered" in text
     farther = [replace(view, depth=view.depth + 1) for view in look]
-    (low, high), (_, highest) = depth_range(look), depth_range([*look, *farther])
-    assert f"&gt;= {highest:.3g}" in page_html(
+    near, both = depth_range(look), depth_range([*look, *farther])
+    assert f"&gt;= {both.high:.3g}" in page_html(
         [facts(), other], [look, farther], depths=[_meta(), _meta()]
     )  # one range for a scene
     foreign = replace(other, config=RunConfig(scene_fingerprint="x"))
-    assert f"&gt;= {high:.3g}" in page_html([facts(), foreign], [look, farther], depths=[_meta(), _meta()])
-    assert low < high < highest
+    assert f"&gt;= {near.high:.3g}" in page_html([facts(), foreign], [look, farther], depths=[_meta(), _meta()])
+    assert near.low < near.high < both.high
 
 
 def test_the_page_shows_cameras_chosen_components_and_how_new_the_views_are(seen):

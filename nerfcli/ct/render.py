@@ -17,7 +17,7 @@ from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
 from nerfcli.output import Output
 from nerfcli.photos.images import write_png
-from nerfcli.render.presentation import coloured
+from nerfcli.render.presentation import ColourRange, coloured
 
 # Outputs that can be rendered from a reconstruction.
 OUTPUTS = ("projection", "transmission", "residual")
@@ -138,4 +138,4 @@ def _slice(result: Reconstruction, axis: str, at: float) -> dict[str, tuple[np.n
 def _write_picture(path: Path, values: np.ndarray, low: float, high: float) -> None:
     with atomic_path(path) as partial:
         tifffile.imwrite(partial, values.astype(np.float32), photometric="minisblack", compression="zlib")
-    write_png(path.with_suffix(".png"), coloured(values, lo=low, hi=high, colour_map="grey"))
+    write_png(path.with_suffix(".png"), coloured(values, ColourRange(low, high), "grey"))

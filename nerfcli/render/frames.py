@@ -250,7 +250,7 @@ def _write_presentation(
         **job.settings.of_presentation(),
         **({"depth_meaning": meta.to_json()} if job.settings.measured else {}),
         **levels,
-        "ranges": ranges,
+        "ranges": {output: asdict(colours) for output, colours in ranges.items()},
         "error_meaning": ERROR_IN_WORDS,
         "facts": facts,
     }

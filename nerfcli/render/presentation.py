@@ -4,10 +4,10 @@ import json
 import math
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -22,32 +22,72 @@ from nerfcli.render.job import MEASURED, RenderJob, meaning_of
 from nerfcli.version import __version__
 
 COLOURS = "turbo"
+DISTANCES = ("depth", "lower", "upper")
+# Where half of all depths lie within this fraction of the range of colours, colours follow inverse depth.
+CROWDED = 0.2
 _HATCH = np.array([[112, 112, 112], [160, 160, 160]], dtype=np.uint8)
 _INK, _PAPER = (20, 20, 20), (255, 255, 255)
 _NUM_TICKS = 5
 
 
-def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float) -> np.ndarray:
+@dataclass(frozen=True)
+class ColourRange:
+    """The values with the first and the last colour, low <= high, and how colours lie between them.
+
+    Args:
+        low: the value with the first colour.
+        high: the value with the last colour.
+        inverse: whether colours follow 1 / value, for depths of which most are near and a few far; low > 0 then.
+
+    Raises:
+        ValueError: low and high are not finite or not in order.
+    """
+
+    low: float
+    high: float
+    inverse: bool = False
+
+    def __post_init__(self):
+        if not -math.inf < self.low <= self.high < math.inf:
+            raise ValueError(f"low <= high must be finite, got {self.low}, {self.high}")
+
+    @classmethod
+    def of_depths(cls, low: float, median: float, high: float) -> Self:
+        """Return the range of depths with these quantiles; inverse if half of them would have nearly one colour."""
+        return cls(low, high, inverse=low > 0.0 and median - low < CROWDED * (high - low))
+
+    def positions(self, values: np.ndarray) -> np.ndarray:
+        """Return the place of each finite value between the first colour, 0, and the last one, 1, in float64."""
+        # Clipped before the division, so that a narrow range neither underflows nor overflows.
+        place = np.clip(values.astype(np.float64), self.low, self.high)
+        if not self.inverse:
+            return (place - self.low) / (self.high - self.low or 1.0)
+        return (1.0 - self.low / place) / (1.0 - self.low / self.high or 1.0)
+
+    def at(self, position: float) -> float:
+        """Return the value at a place between 0 and 1."""
+        if not self.inverse:
+            return self.low + position * (self.high - self.low)
+        return self.low / (1.0 - position * (1.0 - self.low / self.high))
+
+
+def preview(depth: np.ndarray, meta: DepthMeta, colours: ColourRange) -> np.ndarray:
     """Return a depth map in false colours (`COLOURS`: blue near, red far) with a legend below it.
 
-    Depths outside lo...hi have the colours of the ends, as the legend says; pixels that are not finite are hatched
+    Depths outside the range have the colours of its ends, as the legend says; pixels that are not finite are hatched
     grey. A picture too narrow for the legend is centred on a wider sheet. The size depends only on the map's shape and
     the other arguments, so all previews of a video have the same size.
 
     Args:
         depth: (height, width).
-        lo: the depth with the first colour, in the unit of `meta`.
-        hi: the depth with the last colour, >= lo.
+        colours: the range, in the unit of `meta`.
 
     Returns:
         uint8 RGB (height + legend, at least width, 3).
-
-    Raises:
-        ValueError: lo and hi are not finite or not in order.
     """
-    picture = coloured(depth, lo=lo, hi=hi, colour_map=COLOURS)
+    picture = coloured(depth, colours, COLOURS)
     suffix = " m" if meta.unit == "metre" else ""
-    legend = _legend(_lines(meta), suffix, lo=lo, hi=hi, width=depth.shape[1])
+    legend = _legend(_lines(meta, colours), suffix, colours, width=depth.shape[1])
     sheet = np.full((len(picture) + len(legend), legend.shape[1], 3), _PAPER, dtype=np.uint8)
     left = (legend.shape[1] - depth.shape[1]) // 2
     sheet[: len(picture), left : left + depth.shape[1]] = picture
@@ -55,20 +95,14 @@ def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float) -> np.n
     return sheet
 
 
-def coloured(depth: np.ndarray, *, lo: float, hi: float, colour_map: str) -> np.ndarray:
+def coloured(values: np.ndarray, colours: ColourRange, colour_map: str) -> np.ndarray:
     """Return the false colours of `preview` without the legend, uint8 RGB (height, width, 3).
 
-    Arguments and errors are those of `preview`, and one of `colours.COLOUR_MAPS`.
+    Args:
+        colour_map: one of `colours.COLOUR_MAPS`.
     """
-    if not -math.inf < lo <= hi < math.inf:
-        raise ValueError(f"lo <= hi must be finite, got {lo}, {hi}")
-    valid = np.isfinite(depth)
-    # In float64 and clipped before the division, so that a narrow range neither underflows nor overflows.
-    level = np.where(valid, depth, lo).astype(np.float64)
-    np.clip(level, lo, hi, out=level)
-    level -= lo
-    level /= hi - lo or 1.0
-    level *= 255
+    valid = np.isfinite(values)
+    level = 255 * colours.positions(np.where(valid, values, colours.low))
     picture = levels_of(colour_map).take(np.rint(level, out=level).astype(np.uint8), axis=0)
     if not valid.all():
         rows, columns = np.nonzero(~valid)
@@ -77,11 +111,11 @@ def coloured(depth: np.ndarray, *, lo: float, hi: float, colour_map: str) -> np.
 
 
 @lru_cache(maxsize=8)  # all frames of a clip have the same legend
-def _legend(lines: tuple[str, ...], suffix: str, *, lo: float, hi: float, width: int) -> np.ndarray:
+def _legend(lines: tuple[str, ...], suffix: str, colours: ColourRange, *, width: int) -> np.ndarray:
     """Draw a colour bar, numbers with a suffix and lines of text; wider than `width` if the text needs it."""
     size = min(max(round(width / 40), 12), 28)
     font = ImageFont.load_default(size)
-    numbers = _tick_labels(lo, hi, suffix=suffix)
+    numbers = _tick_labels(colours, suffix)
     margin, line = size, round(1.4 * size)
     numbers_width = len(numbers) * max(font.getlength(f"  {text}") for text in numbers)
     text_width = max(numbers_width, *(font.getlength(text) for text in lines))
@@ -104,23 +138,25 @@ def _legend(lines: tuple[str, ...], suffix: str, *, lo: float, hi: float, width:
     return np.asarray(sheet)
 
 
-def _lines(meta: DepthMeta) -> tuple[str, ...]:
+def _lines(meta: DepthMeta, colours: ColourRange) -> tuple[str, ...]:
     """Return the lines of the legend that describe the values."""
+    by_inverse = "colours by 1 / depth; " if colours.inverse else ""
     unit = {"arbitrary": "arbitrary units", "metre": "metres"}.get(meta.unit, meta.unit)
     if meta.quantity in UNIT_OF:
         return meta.title, f"in {unit}; hatched: no value"
-    return f"{meta.title} in {unit}", f"{AXES[meta.axis]}; hatched: no value"
+    return f"{meta.title} in {unit}", f"{AXES[meta.axis]}; {by_inverse}hatched: no value"
 
 
-def _tick_labels(lo: float, hi: float, *, suffix: str) -> list[str]:
-    """Return evenly spaced numbers with enough digits to tell them apart; the ends are marked "<=" and ">="."""
-    step = (hi - lo) / (_NUM_TICKS - 1)
+def _tick_labels(colours: ColourRange, suffix: str) -> list[str]:
+    """Return numbers at even places with enough digits to tell them apart; the ends are marked "<=" and ">="."""
+    values = [colours.at(index / (_NUM_TICKS - 1)) for index in range(_NUM_TICKS)]
+    step = values[1] - values[0]
     decimals = min(max(1 - math.floor(math.log10(step)), 0), 12) if step > 0 else 3
-    numbers = [f"{lo + index * step:.{decimals}f}{suffix}" for index in range(_NUM_TICKS)]
+    numbers = [f"{value:.{decimals}f}{suffix}" for value in values]
     return [f"<= {numbers[0]}", *numbers[1:-1], f">= {numbers[-1]}"]
 
 
-def write_previews(folder: Path, job: RenderJob, meta: DepthMeta) -> dict[str, tuple[float, float]]:
+def write_previews(folder: Path, job: RenderJob, meta: DepthMeta) -> dict[str, ColourRange]:
     """Write a false-colour PNG beside each measured file, with one range per output.
 
     Args:
@@ -139,7 +175,7 @@ def write_previews(folder: Path, job: RenderJob, meta: DepthMeta) -> dict[str, t
     return ranges
 
 
-def _write_previews_of(output: str, folder: Path, job: RenderJob, meaning: DepthMeta) -> tuple[float, float]:
+def _write_previews_of(output: str, folder: Path, job: RenderJob, meaning: DepthMeta) -> ColourRange:
     """Write the previews of one output, and return its range."""
     kept: dict[str, np.ndarray] = {}
 
@@ -152,16 +188,16 @@ def _write_previews_of(output: str, folder: Path, job: RenderJob, meaning: Depth
             kept[name] = values
         return values
 
-    lo, hi = value_range(lambda: map(read, job.names), output)
-    metadata = _texts(meaning) | {"range": f"{lo} {hi}", "colour map": COLOURS}
+    colours = value_range(lambda: map(read, job.names), output)
+    metadata = _texts(meaning) | {"range": json.dumps(asdict(colours)), "colour map": COLOURS}
 
     def write(name: str) -> None:
-        picture = preview(read(name), meaning, lo=lo, hi=hi)
+        picture = preview(read(name), meaning, colours)
         write_png(_picture(folder, output, name), picture, metadata=metadata)
 
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         list(pool.map(write, job.names))
-    return lo, hi
+    return colours
 
 
 def write_videos(
@@ -169,7 +205,7 @@ def write_videos(
     job: RenderJob,
     meta: DepthMeta,
     *,
-    ranges: dict[str, tuple[float, float]],
+    ranges: dict[str, ColourRange],
     notify: Callable[[str], None],
 ) -> None:
     """Write the videos that were ordered, from the pictures in the folder; one picture at a time is in memory.
@@ -198,25 +234,25 @@ def write_videos(
             write_video(path, pictures, fps=settings.fps, comment=comment)
 
 
-def value_range(maps: Callable[[], Iterable[np.ndarray]], output: str) -> tuple[float, float]:
-    """Return the range of colours of a clip: the 1st to the 99th percentile; from 0 for outputs that are not distances.
+def value_range(maps: Callable[[], Iterable[np.ndarray]], output: str) -> ColourRange:
+    """Return the colours of a clip: the 1st to the 99th percentile; from 0 for outputs that are not distances.
 
-    (0, 1) for confidence, and if no pixel has a value.
+    0 to 1 for confidence, and if no pixel has a value.
     """
     # The ends of a colour range: quantiles of all valid pixels of the clip, so that a single speck does not stretch it.
-    found = None if output == "confidence" else quantiles(maps, (0.01, 0.99))
+    found = None if output == "confidence" else quantiles(maps, (0.01, 0.5, 0.99))
     if not found:
-        return 0.0, 1.0
-    lo, hi = found
-    return (lo if output in ("depth", "lower", "upper") else 0.0), hi
+        return ColourRange(0.0, 1.0)
+    low, median, high = found
+    return ColourRange.of_depths(low, median, high) if output in DISTANCES else ColourRange(0.0, high)
 
 
-def _comment(job: RenderJob, meta: DepthMeta, output: str, ranges: dict[str, tuple[float, float]]) -> dict[str, Any]:
+def _comment(job: RenderJob, meta: DepthMeta, output: str, ranges: dict[str, ColourRange]) -> dict[str, Any]:
     """Return the description of a video for its container's comment."""
     description: dict[str, Any] = {"nerfcli": __version__, "outputs": [output], **job.provenance}
     if output in MEASURED:
         description |= meta.to_json()
-        description |= {"ranges": {output: ranges[output]}, "colour_map": COLOURS}
+        description |= {"ranges": {output: asdict(ranges[output])}, "colour_map": COLOURS}
     return description
 
 

@@ -37,7 +37,7 @@ from nerfcli.pages.page import data_uri, fitted, jpeg_bytes
 from nerfcli.photos.colours import levels_of
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.files.depth_pictures import DepthMeta
-from nerfcli.render.presentation import coloured
+from nerfcli.render.presentation import ColourRange, coloured
 from nerfcli.version import __version__
 
 DEPTH_COLOURS = "turbo"
@@ -145,7 +145,7 @@ def _structure(view: HeldOutRenderings) -> str:
     return "not known" if view.metrics.ssim is None else f"{view.metrics.ssim:.3f}"
 
 
-def _depth_ranges(runs: Sequence[RunFacts], looks: Sequence[Sequence[HeldOutRenderings]]) -> list[tuple[float, float]]:
+def _depth_ranges(runs: Sequence[RunFacts], looks: Sequence[Sequence[HeldOutRenderings]]) -> list[ColourRange]:
     """Return the depth range of each run's colour scale, which all runs of a scene share."""
     scenes = scenes_of(runs)
     return [
@@ -155,7 +155,7 @@ def _depth_ranges(runs: Sequence[RunFacts], looks: Sequence[Sequence[HeldOutRend
 
 
 def _views(
-    runs: Sequence[RunFacts], looks: Sequence[Sequence[HeldOutRenderings]], ranges: Sequence[tuple[float, float]]
+    runs: Sequence[RunFacts], looks: Sequence[Sequence[HeldOutRenderings]], ranges: Sequence[ColourRange]
 ) -> tuple[list[dict[str, Any]], list[list[dict[str, str]]]]:
     """Return what is said about each held-out photo, and its layers."""
     layers, shown = [], []
@@ -179,14 +179,14 @@ def _views(
 
 
 def _layers(
-    first: HeldOutRenderings, seen: Sequence[tuple[RunFacts, HeldOutRenderings, tuple[float, float]]], *, alone: bool
+    first: HeldOutRenderings, seen: Sequence[tuple[RunFacts, HeldOutRenderings, ColourRange]], *, alone: bool
 ) -> list[dict[str, str]]:
     """Return the layers of a photo: itself, then the renderings, errors, depths and coverage of all runs."""
 
     def layer(kind: str, run: RunFacts, picture: np.ndarray) -> dict[str, str]:
         return _layer(kind if alone else f"{run.label}: {kind}", picture)
 
-    depths = [(run, coloured(view.depth, lo=low, hi=high, colour_map=DEPTH_COLOURS)) for run, view, (low, high) in seen]
+    depths = [(run, coloured(view.depth, colours, DEPTH_COLOURS)) for run, view, colours in seen]
     return [
         _layer("photo", first.photo),
         *(layer("rendered", run, view.picture) for run, view, _ in seen),
@@ -201,14 +201,15 @@ def _layer(label: str, picture: np.ndarray) -> dict[str, str]:
 
 
 def _legends(
-    runs: Sequence[RunFacts], ranges: Sequence[tuple[float, float]], depths: Sequence[DepthMeta]
+    runs: Sequence[RunFacts], ranges: Sequence[ColourRange], depths: Sequence[DepthMeta]
 ) -> Iterator[dict[str, str]]:
     yield _legend("error", ERROR_COLOURS, "0", f">= {ERROR_RANGE:g}", "mean absolute difference of sRGB in [0, 1]")
     meanings = [(limits, depth.in_words()) for limits, depth in zip(ranges, depths, strict=True)]
-    for (low, high), words in dict.fromkeys(meanings):
-        of = [run.label for run, meaning in zip(runs, meanings, strict=True) if meaning == ((low, high), words)]
+    for colours, words in dict.fromkeys(meanings):
+        of = [run.label for run, meaning in zip(runs, meanings, strict=True) if meaning == (colours, words)]
+        by_inverse = "; colours by 1 / depth" if colours.inverse else ""
         name = "depth" if len(of) == len(runs) else f"depth, {', '.join(of)}"
-        yield _legend(name, DEPTH_COLOURS, f"<= {low:.3g}", f">= {high:.3g}", words)
+        yield _legend(name, DEPTH_COLOURS, f"<= {colours.low:.3g}", f">= {colours.high:.3g}", words + by_inverse)
     words = "training photos that see the surface; hatched: no surface"
     yield _legend("coverage", COVERAGE_COLOURS, "0", f">= {COVERAGE_RANGE}", words)
 

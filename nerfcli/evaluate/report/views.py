@@ -14,7 +14,7 @@ from nerfcli.render.coverage import DepthMap, small_frame, with_coverage
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
-from nerfcli.render.presentation import coloured
+from nerfcli.render.presentation import ColourRange, coloured
 
 # Mean absolute difference of the channels at the last colour of error maps, sRGB in [0, 1].
 ERROR_RANGE = 0.2
@@ -109,16 +109,13 @@ def _coverage_map(model: Model, frame: Frame, photo_depths: Sequence[DepthMap]) 
 
 def coverage_picture(coverage: np.ndarray) -> np.ndarray:
     """Colour a map of coverage, as uint8 RGB; hatched where there is no surface."""
-    return coloured(coverage, lo=0.0, hi=float(COVERAGE_RANGE), colour_map=COVERAGE_COLOURS)
+    return coloured(coverage, ColourRange(0.0, float(COVERAGE_RANGE)), COVERAGE_COLOURS)
 
 
-def depth_range(views: Sequence[HeldOutRenderings]) -> tuple[float, float]:
-    """Return the 1st and 99th percentile of all defined depths; (0, 1) if there are none."""
+def depth_range(views: Sequence[HeldOutRenderings]) -> ColourRange:
+    """Return the colours of depths, from the 1st to the 99th percentile; 0 to 1 if there are none."""
     valid = np.concatenate([np.empty(0), *(view.depth[np.isfinite(view.depth)] for view in views)])
-    if not len(valid):
-        return 0.0, 1.0
-    low, high = np.percentile(valid, (1, 99)).tolist()
-    return low, high
+    return ColourRange.of_depths(*np.percentile(valid, (1, 50, 99)).tolist()) if len(valid) else ColourRange(0.0, 1.0)
 
 
 def error_map(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> np.ndarray:
