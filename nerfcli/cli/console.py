@@ -26,6 +26,8 @@ R = TypeVar("R")
 PLAIN_LINE_SECONDS = 10.0
 # Details may state a better estimate of the time left.
 STATES_LEFT = " left"
+# Of a stage, before its speed says how long the rest takes.
+_LEAST_DONE = 0.02
 # Error numbers of a full disk and of an exhausted quota. Files that commands write have errors of their own for these.
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 # Width of tables in a file or a pipe, which have no width of their own.
@@ -123,41 +125,58 @@ def _print_table(
 @contextmanager
 def _bar(title: str) -> Iterator[Callable[[float, str], None]]:
     from rich.console import Console as RichConsole
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.percentage:3.0f} %"),
         TimeElapsedColumn(),
-        TimeRemainingColumn(),
         TextColumn("{task.fields[detail]}"),
     )
+    clock = _Clock()
     with Progress(*columns, console=RichConsole(stderr=True), transient=True) as bar:
         task = bar.add_task(title, total=1.0, detail="")
-        yield lambda fraction, detail: bar.update(task, completed=fraction, detail=detail)
+        yield lambda fraction, detail: bar.update(
+            task, completed=fraction, detail=clock.with_time_left(fraction, detail)
+        )
 
 
 @contextmanager
 def _plain_lines(title: str) -> Iterator[Callable[[float, str], None]]:
-    began = last = time.monotonic()
-    first: float | None = None  # a training that is resumed does not begin at 0
+    last, clock = time.monotonic(), _Clock()
 
     def update(fraction: float, detail: str) -> None:
-        nonlocal first, last
-        now = time.monotonic()
-        first = fraction if first is None else first
-        if now - last >= PLAIN_LINE_SECONDS:
-            last = now
-            left = "" if STATES_LEFT in detail else _time_left(now - began, fraction - first, 1.0 - fraction)
-            _stderr(f"{title}: {100 * fraction:.0f} % {detail}".rstrip() + left)
+        nonlocal last
+        text = clock.with_time_left(fraction, detail)
+        if time.monotonic() - last >= PLAIN_LINE_SECONDS:
+            last = time.monotonic()
+            _stderr(f"{title}: {100 * fraction:.0f} % {text}".rstrip())
 
     yield update
 
 
-def _time_left(seconds: float, done: float, to_do: float) -> str:
-    """Return the time that the fraction `to_do` takes, for the end of a line, if `done` took these seconds."""
-    return f", about {duration(seconds * to_do / done)} left" if done >= 0.02 else ""
+class _Clock:
+    """The time left in a stage, by its speed since it first moved: what comes before, such as compiling, is no speed.
+
+    A training that is resumed does not begin at 0.
+    """
+
+    def __init__(self) -> None:
+        self._at: float | None = None
+        self._began: float | None = None
+
+    def with_time_left(self, fraction: float, detail: str) -> str:
+        """Return the detail and the time that is left at this fraction, unless it states that itself."""
+        if self._at is None:
+            self._at = fraction
+        if self._began is None and fraction > self._at:
+            self._at, self._began = fraction, time.monotonic()
+        done = fraction - self._at
+        if self._began is None or done < _LEAST_DONE or STATES_LEFT in detail:
+            return detail
+        seconds = (time.monotonic() - self._began) * (1.0 - fraction) / done
+        return f"{detail}, about {duration(seconds)} left"
 
 
 def _stderr(text: str) -> None:

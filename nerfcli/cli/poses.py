@@ -9,6 +9,7 @@ import typer
 from nerfcli.cli import options
 from nerfcli.cli.batch import Given, for_each_input
 from nerfcli.cli.console import command
+from nerfcli.errors import in_shell
 from nerfcli.machine import Resources
 
 if TYPE_CHECKING:
@@ -183,5 +184,7 @@ def poses(
             path = done / "database.db"
             console.note(f"{path} keeps features and matches ({size / 1e6:.0f} MB) so that other settings run faster")
         console.result(done)
+        if not given.one_of_many:
+            console.note(f"next: nerfcli train {in_shell(done)} --budget 90s")
 
     for_each_input(photos, work, command="poses")

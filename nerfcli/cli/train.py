@@ -9,6 +9,7 @@ import typer
 from nerfcli.cli import options
 from nerfcli.cli.batch import STDIN, Given, for_each_input
 from nerfcli.cli.console import Console, command
+from nerfcli.errors import in_shell
 from nerfcli.machine import is_first, is_one_of_several, local_rank_and_size
 
 if TYPE_CHECKING:
@@ -177,6 +178,9 @@ def train(
             )
         if is_first():
             console.result(run.path)
+        if not given.one_of_many:
+            here = in_shell(run.path)
+            console.note(f"next: nerfcli evaluate {here}, or nerfcli render {here} --cameras orbit --video")
 
     for_each_input(scene, work, command="train")
 

@@ -18,7 +18,7 @@ from nerfcli.captures.loading import (
     refuse_without_training_photos,
 )
 from nerfcli.captures.orientation import describe_rescaling
-from nerfcli.errors import UserError, listed, several
+from nerfcli.errors import UserError, duration, listed, several
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import chosen_size, closing_steps
 from nerfcli.machine import is_one_of_several
@@ -107,7 +107,9 @@ def train_scene(
 
     def on_progress(state: loop.Progress) -> None:
         speed = f"{state.samples_per_second / 1e3:.0f} k samples/s"
-        reporter.progress(state.fraction, f"step {state.step}  loss {state.loss:.4f}  {speed}")
+        budget = settings.budget_seconds
+        left = "" if budget is None else f", {duration(max(0.0, budget - state.seconds))} left"
+        reporter.progress(state.fraction, f"step {state.step}  loss {state.loss:.4f}  {speed}{left}")
 
     if is_kept():
         return Run(run)
