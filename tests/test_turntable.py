@@ -1,10 +1,12 @@
 """An object turning before a still background: recognised, masked, solved; and captures not to be mistaken for it."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import synthetic_captures as synthetic
@@ -108,17 +110,37 @@ class TestMotions:
         assert (np.linalg.norm(y - x, axis=1) < within).sum() > 100  # enough to count as a still background
         assert motions(x, y, SIZE).still == 0
 
-    @pytest.mark.parametrize("angle", np.linspace(0, 2 * np.pi, 5)[:4])
-    def test_tripod_that_gives_way_leaves_two_motions(self, angle: float) -> None:
-        """The whole background is shifted by more than the errors of its features and less than the object moves."""
-        shift = 2.5 * still_px(SIZE) * np.array([np.cos(angle), np.sin(angle)])
+    @pytest.mark.parametrize(
+        ("shift", "turned_deg"), [((0.002, -0.002), 0.0), ((-0.1, 0.05), 0.0), ((0.1, 0.0), -1.5), ((0.0, -0.05), 2.5)]
+    )
+    def test_background_that_is_displaced_as_a_whole_stays(self, shift: tuple[float, float], turned_deg: float) -> None:
+        """The tripod gives way, or photos are cropped around the object: a similarity that the object does not follow.
+
+        The shift is in diagonals of the picture.
+        """
+        angle = np.radians(turned_deg)
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         two = 0
         for i, j, moving in ring_pairs():
             x, y = staying(150, seed=i + j)
-            found = both(moving, (x, y + shift))
+            centre = np.array(SIZE) / 2
+            found = both(moving, (x, (y - centre) @ turn.T + centre + np.hypot(*SIZE) * np.array(shift)))
             assert found.still >= 140
             two += found.two
         assert two == len(ring_pairs())
+
+    def test_background_that_moves_far_is_no_still_one(self) -> None:
+        for i, j, moving in ring_pairs():
+            x, y = staying(150, seed=i + j)
+            assert not both(moving, (x, y + 0.2 * np.hypot(*SIZE))).two
+
+    def test_wide_background_is_preferred_to_the_front_of_the_object(self) -> None:
+        """More matches on a flat front follow a similarity of their own, but in a small part of the picture."""
+        front = staying(300, seed=1, box=(0.4, 0.4, 0.6, 0.6))
+        x, y = staying(100, seed=2)
+        found = both((front[0], front[1] + 20), (x, y))
+        assert found.stays[300:].sum() >= 95
+        assert not found.stays[:300].any()
 
     def test_nothing_says_nothing(self) -> None:
         found = motions(np.zeros((0, 2)), np.zeros((0, 2)), SIZE)
@@ -179,12 +201,36 @@ class TestMasks:
         return np.column_stack([columns / width, rows / height])
 
     def check(self, capture: Turntable, pictures: list[np.ndarray], *, cut: float = 0.03, extra: float = 0.03) -> None:
-        behind = still.background(pictures, self.around(capture))
-        for picture, truth in zip(pictures, capture.masks, strict=True):
-            found = still.enlarged(still.differs(picture, behind), truth.shape[::-1])
+        self.check_displaced(capture.masks, pictures, [np.eye(2, 3)] * len(pictures), capture, cut=cut, extra=extra)
+
+    def check_displaced(
+        self,
+        truths: Sequence[np.ndarray],
+        pictures: list[np.ndarray],
+        placed: list[np.ndarray],
+        capture: Turntable,
+        *,
+        cut: float = 0.03,
+        extra: float = 0.03,
+    ) -> None:
+        behind = still.background(pictures, placed, self.around(capture))
+        for picture, similarity, truth in zip(pictures, placed, truths, strict=True):
+            size = (truth.shape[1], truth.shape[0])
+            found = still.enlarged(still.differs(picture, behind.seen_with(similarity, size)), size)
             assert (truth & ~found).sum() < cut * truth.sum()
             assert (found & ~truth).sum() < extra * truth.size
-            assert still.agreement(picture, behind) > 0.8
+
+    def test_photos_may_be_displaced(self, capture: Turntable) -> None:
+        """Each photo is moved and turned by known amounts; what comes in from outside the picture is grey noise."""
+        rng = np.random.default_rng(3)
+        placed, pictures, truths = [], [], []
+        for photo, mask in zip(capture.photos, capture.masks, strict=True):
+            similarity = cv2.getRotationMatrix2D((240, 180), rng.uniform(-1.5, 1.5), 1.0)
+            similarity[:, 2] += rng.uniform(-25, 25, size=2)
+            placed.append(similarity)
+            pictures.append(cv2.warpAffine(photo, similarity, (480, 360), borderMode=cv2.BORDER_REFLECT))
+            truths.append(cv2.warpAffine(mask.astype(np.uint8), similarity, (480, 360)) > 0)
+        self.check_displaced(truths, pictures, placed, capture, cut=0.05, extra=0.05)
 
     def test_masks_hold_the_object_and_little_else(self, capture: Turntable) -> None:
         self.check(capture, [still.small(photo) for photo in capture.photos])
@@ -196,11 +242,6 @@ class TestMasks:
             np.clip(photo * gain, 0, 255).astype(np.uint8) for photo, gain in zip(capture.photos, gains, strict=True)
         ]
         self.check(capture, [still.small(photo) for photo in brighter], cut=0.05, extra=0.06)
-
-    def test_photos_of_another_place_do_not_agree(self, capture: Turntable) -> None:
-        behind = still.background([still.small(photo) for photo in capture.photos], self.around(capture))
-        other = turntable(1, size=(480, 360), supersampled=1, seed=7)
-        assert still.agreement(still.small(other.photos[0]), behind) < 0.2
 
 
 SETTINGS = PoseSettings(max_image_size=480, max_features=500, threads=1)
@@ -243,13 +284,15 @@ class TestPoses:
         position, rotation_deg = errors(capture, folder / "scene")
         assert position < 0.02
         assert rotation_deg < 0.5
-        assert sum("an object moves in front" in note for note in notes) == 1
+        assert sum("the object turns in front of a background that does not (" in note for note in notes) == 1
 
     def test_report_has_the_numbers(self, capture: Turntable, made: tuple[Path, dict, list[str]]) -> None:
         found = made[1]["moving_foreground"]
         assert found["masked"]
         assert found["unmasked"] == []
-        assert found["pairs_two_motions"] > 0.8 * found["pairs"]
+        # No pair shows the object alone; in pairs 45 degrees apart and more, too little of it matches to be a motion.
+        assert found["pairs_one_motion"] == 0
+        assert found["pairs_two_motions"] > 0.7 * found["pairs"]
         assert abs(found["white_share"][1] - capture.masks.mean()) < 0.03
         assert found["object_matches_in_white"] > 0.95
         assert found["background_matches_in_black"] > 0.95
@@ -270,10 +313,23 @@ class TestPoses:
         narrower[:200] = False
         Image.fromarray(narrower).save(mask)
         report, notes = solved(folder / "images", folder / "scene", seed=1)
-        assert sum("an object moves in front" in note for note in notes) == 1
+        assert sum("the object turns in front of a background that does not (" in note for note in notes) == 1
         assert (np.asarray(Image.open(mask)) == narrower).all()
         assert report["moving_foreground"]["masked"]
         assert report["images"][0]["registered"]
+
+    def test_camera_at_two_heights_that_is_turned_a_little_between_photos(self, tmp_path: Path) -> None:
+        """The background of either height moves by 10 px (standard deviation) from photo to photo, 1.7 % of 600 px."""
+        capture = turntable(16, size=(480, 360), heights=2, turn_deg=90, shift_px=10, supersampled=1, seed=2)
+        write(capture, tmp_path)
+        report, notes = solved(tmp_path / "images", tmp_path / "scene")
+        assert report["moving_foreground"]["masked"]
+        assert report["moving_foreground"]["unmasked"] == []
+        assert report["registered"] == len(capture.photos)
+        position, rotation_deg = errors(capture, tmp_path / "scene")
+        assert position < 0.02
+        assert rotation_deg < 0.5
+        assert any("as on a turntable: making masks of it" in note for note in notes)
 
     def test_object_in_a_room_that_turns_with_it_needs_no_masks(self, capture: Turntable, tmp_path: Path) -> None:
         """Like a camera that moves around the object: the background outside the true masks is made grey."""

@@ -12,6 +12,7 @@ Letters: x and y are the pixels of a match in the first and in the second photo,
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from nerfcli.matching.agreement import epipolar_px, fundamental_matrix
@@ -24,9 +25,15 @@ _LEAST_STILL_PX = 0.75
 # motion that changes smoothly over the picture, eight times as many would have moved that far as stayed still.
 _RING = 3.0
 _LEAST_PEAK = 2.0
-# A match that moved by more than this many tolerances moved for certain. The whole background may be shifted by less,
-# as from a tripod that gives way.
+# A match that moved by more than this many tolerances moved for certain.
 _MOVED = 4.0
+# The whole background may be displaced by this fraction of the picture's diagonal, turned and scaled by this much: the
+# tripod gives way, the camera is turned to keep the object in view, or the photos were cropped around it.
+_MOST_SHIFTED = 0.15
+_MOST_TURNED_DEG = 3.0
+_MOST_SCALED = 0.01
+# So many sets of matches that follow one displacement are tried as the background.
+_CANDIDATES = 2
 _LEAST_MATCHES = 15
 # If one geometry explains this fraction of the still and of the moving matches to within 2 tolerances, they are one
 # motion.
@@ -131,45 +138,54 @@ def still_px(size: tuple[int, int]) -> float:
 
 
 def in_place(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return which matches (N, 2) of pictures of (width, height) stay in place, (N,) bool, and the common shift (2,).
+    """Return which matches (N, 2) of pictures of (width, height) stay in place, (N,) bool, and their similarity (2, 3).
 
-    The whole background may be shifted by a few pixels, as from a tripod that gives way. No match is reported if a
-    motion that changes smoothly over the picture would leave as many in place.
+    The whole background may be displaced, as from a camera that was turned a little or photos that were cropped. No
+    match is reported if a motion that changes smoothly over the picture would leave as many in place. Of two candidates
+    the one that is spread over more of the picture is the background.
     """
     within = still_px(size)
-    motion = y - x
-    small = motion[np.linalg.norm(motion, axis=1) < _MOVED * within]
-    shift = np.zeros(2)
-    if len(small) >= _LEAST_MATCHES:
-        starts = np.zeros(2), np.median(small, axis=0)
-        shift = max(
-            (_densest(small, start, within) for start in starts),
-            key=lambda at: int((np.linalg.norm(small - at, axis=1) < within).sum()),
-        )
-    distances = np.linalg.norm(motion - shift, axis=1)
-    stays = distances < within
-    around = int(((distances >= within) & (distances < _RING * within)).sum())
-    if stays.sum() < max(_LEAST_MATCHES, _LEAST_PEAK * around):
-        stays = np.zeros(len(x), dtype=bool)
-    return stays, shift
-
-
-def _densest(motion: np.ndarray, start: np.ndarray, within: float) -> np.ndarray:
-    """Return the mode of motions (N, 2) near a start, by mean shift."""
-    at = start
-    for _ in range(10):
-        near = np.linalg.norm(motion - at, axis=1) < within
-        if not near.any():
+    left = np.ones(len(x), dtype=bool)
+    stays, displaced = np.zeros(len(x), dtype=bool), np.eye(2, 3)
+    for _ in range(_CANDIDATES):
+        if left.sum() < _LEAST_MATCHES:
             break
-        at = motion[near].mean(axis=0)
-    return at
+        found = cv2.estimateAffinePartial2D(x[left], y[left], ransacReprojThreshold=within, confidence=0.999)[0]
+        if found is None:
+            break
+        distances = np.linalg.norm(y - _moved(x, found), axis=1)
+        near = distances < within
+        around = int(((distances >= within) & (distances < _RING * within)).sum())
+        peak = near.sum() >= max(_LEAST_MATCHES, _LEAST_PEAK * around)
+        if peak and _is_small(found, size) and len(_cells(x[near], size)) > len(_cells(x[stays], size)):
+            stays, displaced = near, found
+        left &= ~near
+    return stays, displaced
+
+
+def _is_small(similarity: np.ndarray, size: tuple[int, int]) -> bool:
+    centre = np.array(size) / 2
+    scale, turned = np.hypot(*similarity[:, 0]), np.arctan2(similarity[1, 0], similarity[0, 0])
+    shift = np.linalg.norm(_moved(centre, similarity) - centre) / np.hypot(*size)
+    return abs(scale - 1) < _MOST_SCALED and abs(np.degrees(turned)) < _MOST_TURNED_DEG and shift < _MOST_SHIFTED
+
+
+def _moved(x: np.ndarray, similarity: np.ndarray) -> np.ndarray:
+    return x @ similarity[:, :2].T + similarity[:, 2]
+
+
+def _cells(x: np.ndarray, size: tuple[int, int]) -> frozenset[int]:
+    """Return the numbers of the cells of the picture that contain positions (N, 2)."""
+    columns, rows = _CELLS
+    places = np.floor(x / np.array(size) * np.array(_CELLS)).clip(0, (columns - 1, rows - 1))
+    return frozenset(int(row) * columns + int(column) for column, row in places)
 
 
 def motions(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> Motions:
     """Find the motions in matches (N, 2) of two pictures of the same size (width, height). Deterministic."""
     within = still_px(size)
-    stays, shift = in_place(x, y, size)
-    moves = np.linalg.norm(y - x - shift, axis=1) > _MOVED * within
+    stays, displaced = in_place(x, y, size)
+    moves = np.linalg.norm(y - _moved(x, displaced), axis=1) > _MOVED * within
     fundamental, agree = fundamental_matrix(x[moves], y[moves], within_px=within, least=_LEAST_MATCHES)
     moves[moves] = agree
     agreeing = float("nan")
@@ -177,12 +193,7 @@ def motions(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> Motions:
         common = _common(x, y, one=stays, other=moves, within=within)
         explained = [epipolar_px(x, y, matrix) < 2 * within for matrix in (fundamental, common)]
         agreeing = max(float(min(right[stays].mean(), right[moves].mean())) for right in explained)
-    columns, rows = _CELLS
-    cells = frozenset(
-        int(row) * columns + int(column)
-        for column, row in np.floor(x[stays] / np.array(size) * np.array(_CELLS)).clip(0, (columns - 1, rows - 1))
-    )
-    return Motions(stays, moves, agreeing, cells)
+    return Motions(stays, moves, agreeing, _cells(x[stays], size))
 
 
 def together(pairs: Sequence[tuple[int, int, Motions]]) -> Stationary:

@@ -1,47 +1,48 @@
-"""Detect an object that turns in front of a static background, from a job's features, and make masks of the object.
+"""Detect an object that turns in front of a background that does not, before the long work, and make masks of it.
 
-A few pairs of photos are compared before the long work (see `stationary`). If they show two motions, masks of the
-object are made (see `still_background`), so that the poses describe the object's motion, as if the camera went around
-it.
+Features of a few reduced photos are compared first (see `stationary`), which takes seconds. If they show two motions,
+masks of the object are made (see `still_background`), so that the poses describe the object's motion, as if the camera
+went around it.
 The masks are in the scene's folder, named after the photos like those of `--masks`, and training uses them too.
 Existing masks of an earlier call are used unchanged, since they may have been edited by hand.
 """
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
-import pycolmap
 from PIL import Image
 
 from nerfcli.errors import UserError
-from nerfcli.matching.features import LOOSE_RATIO, mutual_matches
-from nerfcli.matching.graph import connected_groups
-from nerfcli.matching.stationary import Motions, Stationary, motions, together
+from nerfcli.matching.features import LOOSE_RATIO, Features, find_features, mutual_matches
+from nerfcli.matching.stationary import Motions, Stationary, in_place, motions, together
 from nerfcli.photos.images import image_size, read_image
 from nerfcli.photos.masks import read_mask
 from nerfcli.poses.engine.features import feature_keys
-from nerfcli.poses.engine.retrieval import coarsest
 from nerfcli.poses.input import still_background as still
-from nerfcli.poses.input.job import Job, WorkMask
+from nerfcli.poses.input.job import Job, Tell, WorkMask
 from nerfcli.poses.input.layout import write_mask, write_no_mask
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
+# Features are searched in photos reduced to this longer side, and so many are kept.
+_SIDE_PX = 1000
+_MOST_FEATURES = 1200
 # If fewer than this fraction of the first pairs have static matches, no further pairs are compared.
 _FEW_STILL = 0.25
-# A photo from the same camera position agrees with at least this fraction of the background that some photos show.
-_SAME_PLACE = 0.25
+# So many positions of the camera, each with a background of its own, are searched for.
+_MOST_POSITIONS = 8
 # Masks are accepted if most of the object's matches are inside and most of the background's outside, and if the
 # fraction of a photo that they keep, in the median, is in this range.
 _LEAST_RIGHT = 0.7
 _WHITE = (0.003, 0.9)
 # Change this whenever this module would find other masks or facts.
-_VERSION = "two motions, 2"
+_VERSION = "two motions, displaced backgrounds"
 _STAGE = "turntable.json"
 MASKS = "masks"
 
@@ -54,6 +55,46 @@ class ComparedPair:
     second: int
     places: np.ndarray
     motions: Motions
+
+
+@dataclass(frozen=True)
+class _Photo:
+    """What is kept of a photo: size (width, height), the picture reduced by `still.small`, and features."""
+
+    size: tuple[int, int]
+    picture: np.ndarray
+    features: Features
+
+
+class _Photos:
+    """Photos of a job by number, read when first needed."""
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self._read: dict[int, _Photo] = {}
+
+    def __getitem__(self, number: int) -> _Photo:
+        return self._read[number]
+
+    def read(self, numbers: Collection[int]) -> None:
+        """Read photos that were not read before, several at a time."""
+        missing = sorted(set(numbers) - self._read.keys())
+        with ThreadPoolExecutor(max(self._job.threads, 1)) as pool:
+            self._read.update(zip(missing, pool.map(self._photo, missing), strict=True))
+
+    def _photo(self, number: int) -> _Photo:
+        pixels = np.ascontiguousarray(read_image(self._job.photos / self._job.files[number])[..., :3])
+        grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+        features = find_features(grey, longer_side_px=_SIDE_PX, most=_MOST_FEATURES)
+        return _Photo((grey.shape[1], grey.shape[0]), still.small(pixels), features)
+
+    def matches(self, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pixels (N, 2) in two photos at which they match; none in photos of other sizes."""
+        one, other = self[first].features, self[second].features
+        if self[first].size != self[second].size:
+            return np.zeros((0, 2)), np.zeros((0, 2))
+        a, b = mutual_matches(one.descriptors, other.descriptors, ratio=LOOSE_RATIO)
+        return one.pixels[a], other.pixels[b]
 
 
 def scene_masks(job: Job) -> Path:
@@ -88,14 +129,16 @@ def recall_masks(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
     return replace(job, masks=tuple(masks)), content
 
 
-def mask_turning_object(job: Job, featured: Job) -> tuple[Job, dict[str, Any] | None]:
+def mask_turning_object(job: Job, tell: Tell) -> tuple[Job, dict[str, Any] | None]:
     """Return the job with masks of the object, if one turns in front of a static background, and the facts to report.
 
-    The database has the features of the job `featured`, with the same photos or some of them. The job is unchanged if
-    no masks can be accepted; the facts are None if there is nothing to report.
+    The job is unchanged if no masks can be accepted; the facts are None if there is nothing to report. Held-out photos
+    get masks too, but only training photos decide whether and which. `tell` receives what was found.
     """
     start = time.perf_counter()
-    compared = _compare_photos(featured)
+    photos = _Photos(job)
+    training = [number for number in range(len(job.files)) if number not in job.held_out]
+    compared = _compare_photos(photos, training)
     motions = _together(compared)
     if not motions.two_motions:
         write_stage(Path(job.folder) / _STAGE, _key(job), {})
@@ -111,9 +154,8 @@ def mask_turning_object(job: Job, featured: Job) -> tuple[Job, dict[str, Any] | 
     }
     masks: list[np.ndarray | None] = [None] * len(job.files)
     if motions.found:
-        number = [job.files.index(file) for file in featured.files]
-        compared = [replace(pair, first=number[pair.first], second=number[pair.second]) for pair in compared]
-        masks = _make_masks(job, compared)
+        tell("the object turns in front of a background that does not, as on a turntable: making masks of it")
+        masks = _make_masks(photos, training, others=job.held_out)
         facts |= _judge_masks(masks, compared)
     facts["masked"] = facts.get("why_not") is None and motions.found
     facts["unmasked"] = [name for name, mask in zip(job.names, masks, strict=True) if mask is None]
@@ -127,11 +169,14 @@ def mask_turning_object(job: Job, featured: Job) -> tuple[Job, dict[str, Any] | 
 def describe_motions(facts: dict[str, Any]) -> str:
     """Describe the result for the user."""
     text = (
-        f"an object moves in front of a static background, as on a turntable ({facts['pairs_two_motions']} of "
-        f"{facts['pairs']} pairs show both motions)"
+        f"the object turns in front of a background that does not ({facts['pairs_two_motions']} of {facts['pairs']} "
+        "pairs show both motions)"
     )
     if not facts["masked"]:
-        return f"{text}; no masks of the object could be created, because {facts['why_not']}: give masks with --masks"
+        return (
+            f"{text}; no masks of the object could be created, because {facts['why_not']}: give masks with --masks, "
+            "white where the object is and black elsewhere"
+        )
     several = len(facts["unmasked"])
     rest = f", except for {several} photos" if several else ""
     return f"{text}: its masks are in {MASKS}/ of the scene{rest}, and the poses are relative to the object"
@@ -142,38 +187,33 @@ def add_advice(error: UserError, facts: dict[str, Any] | None) -> UserError:
     if facts is None or not facts["wide"]:
         return error
     masks = f"the edited masks in {MASKS}/ of the scene" if facts["masked"] else "white where the object is"
-    hint = f"an object moves in front of a static background: give masks of it with --masks, {masks}; or {error.hint}"
+    found = "the object turns in front of a background that does not"
+    hint = f"{found}: give masks of it with --masks, {masks}; or {error.hint}"
     return UserError(error.message, hint, error.exit_code)
 
 
-def _compare_photos(job: Job) -> list[ComparedPair]:
+def _compare_photos(photos: _Photos, numbers: Sequence[int]) -> list[ComparedPair]:
     """Compare photos near and far in the order of names; all pairs of a selection if names seem to have no order."""
 
-    @cache
-    def features(number: int) -> tuple[np.ndarray, np.ndarray]:
-        with pycolmap.Database.open(job.database) as database:
-            return coarsest(database, job.image_ids[number], 1200)
-
     def compare(chosen: Iterable[tuple[int, int]]) -> list[ComparedPair]:
+        pairs = sorted((numbers[first], numbers[second]) for first, second in chosen)
+        photos.read({number for pair in pairs for number in pair})
         found = []
-        for first, second in sorted(chosen):
-            if sizes[first] == sizes[second]:
-                (x, one), (y, other) = features(first), features(second)
-                a, b = mutual_matches(one, other, ratio=LOOSE_RATIO)
-                moves = motions(x[a], y[b], sizes[first])
-                found.append(ComparedPair(first, second, x[a] / sizes[first], moves))
+        for first, second in pairs:
+            size = photos[first].size
+            x, y = photos.matches(first, second)
+            found.append(ComparedPair(first, second, x / size, motions(x, y, size)))
         return found
 
-    sizes = [job.sizes[image_id] for image_id in job.image_ids]
-    few_anchors, anchors = 8, 24
-    few, more = _pairs(len(sizes), few_anchors), _pairs(len(sizes), anchors)
+    few_anchors, anchors = 6, 24
+    few, more = _pairs(len(numbers), few_anchors), _pairs(len(numbers), anchors)
     pairs = compare(few)
-    if sum(pair.motions.still > 0 for pair in pairs) < _FEW_STILL * len(pairs):
+    if _together(pairs).found or sum(pair.motions.still > 0 for pair in pairs) < _FEW_STILL * len(pairs):
         return pairs
     pairs += compare(more - few)
     found = _together(pairs)
     if found.still > found.moved and not found.two_motions:
-        pairs += compare(set(combinations(_anchors(len(sizes), anchors), 2)) - more - few)
+        pairs += compare(set(combinations(_anchors(len(numbers), anchors), 2)) - more - few)
     return pairs
 
 
@@ -193,26 +233,39 @@ def _pairs(count: int, most: int) -> set[tuple[int, int]]:
     return {pair for pair in near | far if pair[0] < pair[1]}
 
 
-def _make_masks(job: Job, pairs: Sequence[ComparedPair]) -> list[np.ndarray | None]:
-    """Return a small mask of the object for each photo, None for photos without a matching background."""
-    # Photos connected by static matches have one camera position.
-    static = [(pair.first, pair.second) for pair in pairs if pair.motions.two or pair.motions.only_still]
-    groups = [group for group in connected_groups(range(len(job.files)), static) if len(group) > 1]
-    pictures = [still.small(read_image(job.photos / file)[..., :3]) for file in job.files]
-    behinds = []
-    for group in groups:
-        members = [number for number in group if pictures[number].shape == pictures[group[0]].shape]
-        inside = set(members)
-        stay = [pair.places[pair.motions.stays] for pair in pairs if {pair.first, pair.second} <= inside]
-        if len(members) >= still.LEAST_PHOTOS and stay:
-            behinds.append(still.background([pictures[number] for number in members], np.concatenate(stay)))
-    masks: list[np.ndarray | None] = []
-    for picture in pictures:
-        fitting = [behind for behind in behinds if behind.colours.shape == picture.shape]
-        agreements = [still.agreement(picture, behind) for behind in fitting]
-        best = max(agreements, default=0.0)
-        masks.append(still.differs(picture, fitting[agreements.index(best)]) if best >= _SAME_PLACE else None)
-    return masks
+def _make_masks(photos: _Photos, training: Sequence[int], *, others: Collection[int]) -> list[np.ndarray | None]:
+    """Return a small mask of the object for each photo, None for photos without a matching background.
+
+    The backgrounds are those of the training photos. From one position of the camera, they are equal but for a
+    similarity: each photo that has one with the middle photo of those left has the same position.
+    """
+    left = sorted({*training, *others})
+    photos.read(left)
+    masks: dict[int, np.ndarray | None] = dict.fromkeys(left)
+    for _ in range(_MOST_POSITIONS):
+        candidates = [number for number in left if number in training]
+        if len(candidates) < still.LEAST_PHOTOS:
+            break
+        middle = candidates[len(candidates) // 2]
+        size, picture = photos[middle].size, photos[middle].picture
+        scale = picture.shape[1] / size[0]
+        found, places = {middle: np.eye(2, 3)}, []
+        for number in left:
+            x, y = photos.matches(middle, number)
+            stays, similarity = in_place(x, y, size)
+            if stays.any() and number != middle:
+                found[number] = similarity * (1, 1, scale)
+                places.append(x[stays] / size)
+        left = [number for number in left if number not in found]
+        members = [number for number in found if number in training]
+        if len(members) < still.LEAST_PHOTOS:
+            continue
+        pictures = [photos[number].picture for number in members]
+        behind = still.background(pictures, [found[number] for number in members], np.concatenate(places))
+        for number, similarity in found.items():
+            shown = photos[number].picture
+            masks[number] = still.differs(shown, behind.seen_with(similarity, (shown.shape[1], shown.shape[0])))
+    return [masks[number] for number in sorted(masks)]
 
 
 def _judge_masks(masks: Sequence[np.ndarray | None], pairs: Sequence[ComparedPair]) -> dict[str, Any]:

@@ -168,17 +168,13 @@ def _mask_object(
 ) -> tuple[Job, dict[str, Any] | None]:
     """Return the job with masks of an object that turns in front of a static background, and facts to report, if any.
 
-    Held-out photos get masks too, but only features of the training photos are compared. Panoramas are not
-    checked: what stands still in them is the tripod, or the person holding the camera.
+    Panoramas are not checked: what stands still in them is the tripod, or the person holding the camera.
     """
     if any(group.is_panorama for group in job.groups):
         return job, None
-    discard_if_damaged(job.database)
-    with _timed(seconds, "extract"):
-        extract(training_part(job), report)
     checks, name = _checks(job), "moving foreground"
     with _timed(seconds, "motions"):
-        found = checks.run(name, lambda: mask_turning_object(job, training_part(job)), otherwise=None)
+        found = checks.run(name, lambda: mask_turning_object(job, tell), otherwise=None)
     if found is None:
         tell(f"could not check for an object moving in front of a static background: {checks.not_computed[name]}")
         return job, None

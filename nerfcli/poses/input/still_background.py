@@ -1,5 +1,6 @@
 """Masks of an object that turns in front of a static background, from photos of a camera on a tripod.
 
+The photos may be displaced by a similarity each, as from a camera that was turned to keep the object in view.
 The most frequent colour of a pixel is the background, wherever the object leaves it visible in some photos: an object
 that turns shows other colours each time. Where no colour recurs as precisely as at the background's features, the
 object always covers the pixel. The object in a photo is these pixels and those that differ from the background, with
@@ -17,6 +18,10 @@ import cv2
 import numpy as np
 from scipy.ndimage import binary_fill_holes
 
+# Levels of a photo where it shows nothing, times its rank: they differ by more than those of any picture.
+_OUTSIDE = 1000.0
+# A tolerance that no difference exceeds.
+_UNKNOWN = 1e6
 # The longer side of the pictures that are compared.
 SIDE_PX = 480
 # Fewer photos than this are too few to find the background.
@@ -38,12 +43,30 @@ _CLOSED_PX = 4
 
 @dataclass(frozen=True)
 class Background:
-    """Static background: colours (h, w, 3) float32; tolerance of each pixel, (h, w); and where the object always covers
-    it, (h, w) bool."""
+    """Static background, which may be larger than a photo.
+
+    Args:
+        colours: (h, w, 3) float32.
+        tolerance: (h, w) float32, of each pixel; beyond any difference where too few photos show it.
+        covered: (h, w) bool, where the object always covers it.
+        origin: its first pixel in the frame of reference, x and y.
+    """
 
     colours: np.ndarray
     tolerance: np.ndarray
     covered: np.ndarray
+    origin: tuple[int, int]
+
+    def seen_with(self, placed: np.ndarray, size: tuple[int, int]) -> "Background":
+        """Return the background in the frame of a picture of (width, height), from its similarity, see `background`."""
+        moved = cv2.invertAffineTransform(placed)
+        moved[:, 2] -= self.origin
+        return Background(
+            _warped(self.colours, moved, size, outside=0.0),
+            _warped(self.tolerance, moved, size, outside=_UNKNOWN),
+            _warped(self.covered.astype(np.float32), moved, size, outside=0.0) > 0.5,
+            origin=(0, 0),
+        )
 
 
 def small(picture: np.ndarray) -> np.ndarray:
@@ -54,15 +77,26 @@ def small(picture: np.ndarray) -> np.ndarray:
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
 
-def background(pictures: Sequence[np.ndarray], places: np.ndarray) -> Background:
+def background(pictures: Sequence[np.ndarray], placed: Sequence[np.ndarray], places: np.ndarray) -> Background:
     """Estimate the static background of pictures (h, w, 3) from one camera position, `LEAST_PHOTOS` or more.
 
     Args:
         pictures: of equal size, see `small`.
-        places: (N, 2) positions of static features of the background, as fractions of width and height, 0...1.
+        placed: the similarity (2, 3) of each, from pixels of the frame of reference to its own.
+        places: (N, 2) positions of static features in the frame of reference, as fractions of width and height, 0...1.
     """
     chosen = np.unique(np.linspace(0, len(pictures) - 1, min(len(pictures), 40)).astype(int))
-    stack = np.stack([pictures[index] for index in chosen]).astype(np.float32)  # (n, h, w, 3)
+    height, width = pictures[0].shape[:2]
+    corners = np.array([(0, 0, 1), (width, 0, 1), (0, height, 1), (width, height, 1)], dtype=float)
+    spans = np.concatenate([corners @ cv2.invertAffineTransform(placed[index]).T for index in chosen])
+    (left, top), (right, bottom) = np.floor(spans.min(axis=0)).astype(int), np.ceil(spans.max(axis=0)).astype(int)
+    origin, size = (int(left), int(top)), (int(right - left), int(bottom - top))
+    stack = np.stack(
+        [
+            _warped(pictures[index].astype(np.float32), _from(origin, placed[index]), size, outside=-_OUTSIDE * rank)
+            for rank, index in enumerate(chosen, start=1)
+        ]
+    )  # (n, h, w, 3)
     window = max(3, round(_FRACTION * len(stack)))
     light = stack.mean(axis=3)
     order = np.argsort(light, axis=0)
@@ -71,17 +105,19 @@ def background(pictures: Sequence[np.ndarray], places: np.ndarray) -> Background
     first = spread.argmin(axis=0)  # (h, w)
     members = np.take_along_axis(order, first[None] + np.arange(window)[:, None, None], axis=0)
     values = np.take_along_axis(stack, members[..., None], axis=0)  # (window, h, w, 3)
-    colours = np.median(values, axis=0)
-    noise = cv2.GaussianBlur(np.median(np.abs(values - colours), axis=0).max(axis=2), (0, 0), 2)
-    height, width = noise.shape
-    columns, rows = (places * (width, height)).astype(int).clip(0, (width - 1, height - 1)).T
+    unknown = spread.min(axis=0) > 255
+    colours = np.where(unknown[..., None], 0, np.median(values, axis=0)).astype(np.float32)
+    deviation = np.where(unknown, 0, np.median(np.abs(values - colours), axis=0).max(axis=2))
+    noise = cv2.GaussianBlur(deviation, (0, 0), 2)
+    columns, rows = (places * (width, height) - origin).astype(int).clip(0, (size[0] - 1, size[1] - 1)).T
     usual = float(np.quantile(noise[rows, columns], 0.9))  # but for the worst
     most = _LESS_PRECISE * (usual + 1)
     grey = colours.mean(axis=2)
     across, down = cv2.Sobel(grey, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(grey, cv2.CV_32F, 0, 1) / 8
     edges = cv2.dilate(np.hypot(across, down), np.ones((3, 3), np.uint8))
     tolerance = _LEVELS + _NOISES * np.minimum(noise, most) + _DISPLACED_PX * edges
-    return Background(colours, tolerance, noise > most)
+    tolerance[unknown] = _UNKNOWN
+    return Background(colours, tolerance.astype(np.float32), noise > most, origin)
 
 
 def differs(picture: np.ndarray, behind: Background) -> np.ndarray:
@@ -99,15 +135,20 @@ def differs(picture: np.ndarray, behind: Background) -> np.ndarray:
     return cv2.dilate(kept.astype(np.uint8), _disc(_CLOSED_PX // 2)) > 0
 
 
-def agreement(picture: np.ndarray, behind: Background) -> float:
-    """Return the fraction of pixels with a known background at which a picture (h, w, 3) agrees with it."""
-    free = ~behind.covered
-    return float(np.mean(_distances(picture, behind)[free] <= 1)) if free.any() else 0.0
-
-
 def enlarged(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Enlarge a mask to the size (width, height) of its photo, with smooth edges."""
     return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5
+
+
+def _from(origin: tuple[int, int], placed: np.ndarray) -> np.ndarray:
+    """Return a similarity (2, 3) of pixels that are counted from an origin."""
+    return np.column_stack([placed[:, :2], placed @ np.array([*origin, 1.0])])
+
+
+def _warped(values: np.ndarray, similarity: np.ndarray, size: tuple[int, int], *, outside: float) -> np.ndarray:
+    """Return values (h, w) or (h, w, 3) in another frame of (width, height); a similarity (2, 3) leads from there."""
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(values, similarity, size, flags=flags, borderValue=(outside,) * 3)
 
 
 def _distances(picture: np.ndarray, behind: Background) -> np.ndarray:
