@@ -205,7 +205,7 @@ class TestMasks:
 
     def check_displaced(
         self,
-        truths: Sequence[np.ndarray],
+        truths: Sequence[np.ndarray] | np.ndarray,
         pictures: list[np.ndarray],
         placed: list[np.ndarray],
         capture: Turntable,

@@ -1,10 +1,10 @@
 """Detect two motions in a capture: a background fixed in the image, and a moving object.
 
-A tripod and a turntable give two sets of matches. Matches on the background do not move at all in any pair of photos;
-matches on the object follow their own epipolar geometry, which the first set contradicts. No other capture has both.
-With a moving camera, hardly any match stays in place, and those that do (far away, at the point that the camera keeps
-in the centre, at the point that it moves towards) agree with the geometry of the rest. Copies of one photo have matches
-that do not move, but no others.
+A tripod and a turntable give two sets of matches. Matches on the background do not move in any pair of photos, or are
+displaced together by a similarity that is nearly none; matches on the object follow their own epipolar geometry, which
+the first set contradicts. No other capture has both. With a moving camera, hardly any match stays in place, and those
+that do (far away, at the point that the camera keeps in the centre, at the point that it moves towards) agree with the
+geometry of the rest. Copies of one photo have matches that do not move, but no others.
 
 Letters: x and y are the pixels of a match in the first and in the second photo, F a fundamental matrix.
 """

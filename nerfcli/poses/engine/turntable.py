@@ -237,7 +237,8 @@ def _make_masks(photos: _Photos, training: Sequence[int], *, others: Collection[
     """Return a small mask of the object for each photo, None for photos without a matching background.
 
     The backgrounds are those of the training photos. From one position of the camera, they are equal but for a
-    similarity: each photo that has one with the middle photo of those left has the same position.
+    similarity: each photo that has one with the middle photo of those left, or with the first or last of those that
+    have, has the same position.
     """
     left = sorted({*training, *others})
     photos.read(left)
@@ -248,21 +249,26 @@ def _make_masks(photos: _Photos, training: Sequence[int], *, others: Collection[
             break
         middle = candidates[len(candidates) // 2]
         size, picture = photos[middle].size, photos[middle].picture
-        scale = picture.shape[1] / size[0]
-        found, places = {middle: np.eye(2, 3)}, []
-        for number in left:
-            x, y = photos.matches(middle, number)
-            stays, similarity = in_place(x, y, size)
-            if stays.any() and number != middle:
-                found[number] = similarity * (1, 1, scale)
-                places.append(x[stays] / size)
+        found, places = {middle: np.eye(3)}, []
+        for choose in (min, min, max):  # the middle one, then the first and the last that were found
+            reference = choose(found)
+            for number in left:
+                if number in found:
+                    continue
+                x, y = photos.matches(reference, number)
+                stays, similarity = in_place(x, y, size)
+                if stays.any():
+                    found[number] = np.vstack([similarity, (0, 0, 1)]) @ found[reference]
+                    if reference == middle:
+                        places.append(x[stays] / size)
         left = [number for number in left if number not in found]
         members = [number for number in found if number in training]
         if len(members) < still.LEAST_PHOTOS:
             continue
         pictures = [photos[number].picture for number in members]
-        behind = still.background(pictures, [found[number] for number in members], np.concatenate(places))
-        for number, similarity in found.items():
+        reduced = {number: placed[:2] * (1, 1, picture.shape[1] / size[0]) for number, placed in found.items()}
+        behind = still.background(pictures, [reduced[number] for number in members], np.concatenate(places))
+        for number, similarity in reduced.items():
             shown = photos[number].picture
             masks[number] = still.differs(shown, behind.seen_with(similarity, (shown.shape[1], shown.shape[0])))
     return [masks[number] for number in sorted(masks)]
