@@ -26,7 +26,7 @@ ALL = CaptureTraits(has_alpha=False, has_points=True, has_exif=True)
 
 def test_every_component_is_varied_but_those_that_change_what_is_measured():
     found = variants(Components(), ALL)
-    assert {variant.name.partition("=")[0] for variant in found} == set(CHOICES) - {"masks", "stereo"}
+    assert {variant.name.partition("=")[0] for variant in found} == set(CHOICES) - {"masks", "stereo", "sensor"}
     adds = {variant.name: variant.adds for variant in found}
     assert adds["view=0"] is False
     assert adds["near=false"] is False

@@ -13,7 +13,7 @@ from nerfcli.cameras.rigid import Similarity, rotation_from_vector
 from nerfcli.matching.stereo import LONGER_SIDE_PX, SECONDS_PER_PIXEL, DenseDepth, affordable_side_px, dense_depths
 from nerfcli.matching.tracks import Tracks
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.training.evidence import stereo_depths
+from nerfcli.training.evidence import dense_points
 from nerfcli.training.pool import PixelPool
 
 PINHOLE = Camera.pinhole(200, 150, 180.0)
@@ -139,7 +139,7 @@ def test_depths_are_pixels_of_the_pool_in_its_frame():
     photos = [photo(x) for x in OFFSETS]
     pool = PixelPool(photos, similarity, torch.device("cpu"))
     depths = found(photos)
-    of_stereo = stereo_depths(depths, pool, similarity)
+    of_stereo = dense_points(depths, pool, similarity)
     rays = pool.rays_of(of_stereo.numbers)
     points = similarity.inverse().apply(
         (rays.origins + rays.directions * of_stereo.distances[:, None]).double().numpy()

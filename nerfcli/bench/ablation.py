@@ -79,8 +79,8 @@ def _offers(name: str, chosen: Components, capture: CaptureTraits) -> list[Value
     """Return the values with which the component may be added."""
     if (name == "background" and capture.has_alpha) or (name == "points" and not capture.has_points):
         return []
-    if name == "stereo" and not chosen.points:
-        return []
+    if name == "sensor" or (name == "stereo" and not chosen.points):
+        return []  # the selection has taken the depths of a sensor, if there are any
     if name == "exposure" and capture.has_exif:
         return ["exif", "matched", CHOICES[name].on]
     return [CHOICES[name].on]

@@ -10,8 +10,32 @@ import numpy as np
 from nerfcli.cameras.camera import Camera
 from nerfcli.errors import UserError
 
+MILLIMETRE = 1e-3
 # Width and height in pixels.
 Size = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class SensorDepth:
+    """A depth map that a sensor took with a photo: z along the optical axis, of about the same view, at any resolution.
+
+    Args:
+        path: the file, see `photos.sensor_depth`.
+        unit: of its numbers, in metres; training scales them to the scene.
+        confidence: a file of the same size with levels from 0, the least, to 2 or 255; None if there is none.
+    """
+
+    path: Path
+    unit: float = 1.0
+    confidence: Path | None = None
+
+    @classmethod
+    def found(cls, *paths: Path, unit: float = 1.0, confidence: Path | None = None) -> "SensorDepth | None":
+        """Return the first of these maps that is on disk, with its confidence if that is; None without one."""
+        path = next(filter(Path.is_file, paths), None)
+        if path is None:
+            return None
+        return cls(path, unit, confidence if confidence is not None and confidence.is_file() else None)
 
 
 @dataclass(frozen=True)
@@ -25,6 +49,7 @@ class Frame:
         world_from_cam: (4, 4) rigid, OpenCV axes, float64.
         image: the picture's file; None for the frames of a camera path.
         mask: the mask's file: black where the picture is not to be used.
+        depth: the depth map of a sensor; None if there is none.
         split: "train", "test" or "val" where the capture's format fixes one, else None.
     """
 
@@ -34,6 +59,7 @@ class Frame:
     image: Path | None = None
     mask: Path | None = None
     split: str | None = None
+    depth: SensorDepth | None = None
 
     @property
     def has_photo(self) -> bool:

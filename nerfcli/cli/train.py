@@ -29,6 +29,9 @@ class Fit:
     steps: Annotated[
         int | None, typer.Option(help="Total optimizer steps; results repeat bit for bit on a CPU.", min=1)
     ] = None
+    sensor_depth: Annotated[
+        bool, typer.Option("--no-sensor-depth", help="Leave out depth maps of a sensor, like --without sensor.")
+    ] = True
     include: options.Include = None
     exclude: options.Exclude = None
     field: options.FieldKind = None
@@ -66,6 +69,7 @@ class Fit:
         if self.field not in (None, "hash") and self.log2_rows is not None:
             message = "it works with --field hash; for other fields, give --field-memory"
             raise typer.BadParameter(message, param_hint="--log2-rows")
+        excluded = [*(self.exclude or ()), *([] if self.sensor_depth else ["sensor"])]
         budget = DEFAULT_BUDGET if self.budget is None and self.steps is None else self.budget
         sized = training.settings(budget, self.steps)
         largest = self.batch or sized.samples_per_step
@@ -73,9 +77,9 @@ class Fit:
         return replace(
             sized,
             contraction=options.contraction_name(self.contraction),
-            components=choose(Components(), included=self.include or (), excluded=self.exclude or ()),
+            components=choose(Components(), included=self.include or (), excluded=excluded),
             model=options.one_of(self.model, ("auto", "default"), "--model"),
-            fixed=options.named_components(self.include, self.exclude),
+            fixed=options.named_components(self.include, excluded),
             first_samples_per_step=min(sized.first_samples_per_step, largest),
             samples_per_step=largest,
             log2_rows=self.log2_rows or sized.log2_rows,
@@ -123,14 +127,15 @@ def train(
       masks       ignore, empty: whether black in masks is unknown or empty space
       points      a weight: surfaces at the 3D points of matched features
       stereo      true, false: with points, also at depths from stereo matching of the training photos
+      sensor      true, false: surfaces at the depths of a sensor, where the capture has its maps
       near        true, false: smaller gradients near cameras
       distortion  a weight: concentrate the density along each ray
       antialias   true, false: fade out details smaller than a pixel; for photos from near and far
       occluders   true, false: leave out what hides, in one photo, a surface that others see
 
-    Unless they are set with --with or --without, points, stereo, occluders, exposure, cameras, background and view are
-    selected automatically. The first three and exposures from matched pixels are used where the photos support them,
-    unless that loses more than 1 dB in a trial. For the rest, short trainings on up to 15 % of the budget keep a
+    Unless they are set with --with or --without, points, stereo, sensor, occluders, exposure, cameras, background and
+    view are selected automatically. The first four and exposures from matched pixels are used where the photos support
+    them, unless that loses more than 1 dB in a trial. For the rest, short trainings on up to 15 % of the budget keep a
     component if it improves PSNR by more than the noise, on training pixels left out of these trials. --model default
     skips the selection.
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from nerfcli.atomic import write_json
 from nerfcli.captures.calibration import Calibration
 from nerfcli.captures.formats import scene_folder
+from nerfcli.captures.formats.registry import depths_beside
 from nerfcli.captures.holdout import names_held_out
 from nerfcli.errors import UserError, several
 from nerfcli.poses.engine.strict import move_held_out_last
@@ -213,6 +214,7 @@ def _describe_scene(report: PosesReport, scene_dir: Path, photos_dir: Path, *, g
         provenance=provenance,
         unit="arbitrary",
         masks=_masks_of(report, scene_dir),
+        depths=depths_beside(photos_dir),
         split=_split(report, report.settings.holdout),
     )
 

@@ -28,6 +28,7 @@ from nerfcli.training.pool import Album, PixelPool, PointDepths
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import Budget
+from nerfcli.training.sensor_depths import sensor_depths
 
 # Fewer photos with EXIF exposures cannot confirm the matched ones.
 FEWEST_EXIF = 5
@@ -37,7 +38,7 @@ LEAST_SKY_FRACTION = 0.05
 LEAST_MISS_PX = 0.6
 # Reprojection error at which a point has half the weight, in pixels of the training photo.
 HALF_ERROR_PX = 1.0
-# Expected relative error of a stereo distance at which its pixel has half the weight.
+# Expected relative error of a distance, by stereo or a sensor, at which its pixel has half the weight.
 HALF_ERROR = 0.05
 # Values of "cameras" with which focal lengths are learned.
 LEARN_FOCAL = ("focal", "all")
@@ -56,6 +57,7 @@ class Evidence:
         sky: (pixels,) bool, the pixels of the pool that look like a sky; None if they are too few to be one.
         track_depths: of points from structure from motion, or of matched features.
         stereo_depths: from stereo matching.
+        sensor_depths: from a sensor's maps.
         log_gains: (photos, 3) logarithms of exposures from pixels that several photos share; NaN where unknown.
         occluders: for each photo the mask (H, W) of pixels where something hides a surface that other photos see.
         seconds: that each took, by name.
@@ -68,6 +70,7 @@ class Evidence:
     sky: Tensor | None = None
     track_depths: PointDepths | None = None
     stereo_depths: PointDepths | None = None
+    sensor_depths: PointDepths | None = None
     log_gains: np.ndarray | None = None
     occluders: list[np.ndarray] | None = None
     seconds: dict[str, float] = field(default_factory=dict)
@@ -141,10 +144,28 @@ def collect_evidence(
         settings: their components; with model="auto", what is open is not decided yet unless it is `fixed`.
         is_new: whether this training begins now, so that open components and focal lengths are decided.
     """
+    found = _of_photos(photos, pool, extent, settings=settings, is_new=is_new, notify=notify)
+    is_open = is_new and settings.model == "auto" and "sensor" not in settings.fixed and not pool.has_alpha
+    can_match = photos.shared.of_model.count or Budget.of(settings).allows_matching(photos.shared.matching_seconds)
+    if settings.components.sensor or (is_open and can_match):
+        _find_sensor_depths(found, photos, pool, training_from_scene=extent.training_from_scene, notify=notify)
+    return found
+
+
+def _of_photos(
+    photos: TrainingPhotos,
+    pool: PixelPool,
+    extent: Extent,
+    *,
+    settings: TrainSettings,
+    is_new: bool,
+    notify: Callable[[str], None],
+) -> Evidence:
+    """Return what the photos alone tell; see `collect_evidence`."""
     album, shared, wanted, fixed = photos.album.photos, photos.shared, settings.components, settings.fixed
     budget, threads = Budget.of(settings), settings.threads
     selects = is_new and settings.model == "auto"
-    found = Evidence(may_match=budget.allows_matching(shared.matching_seconds))
+    found = Evidence(may_match=budget.allows_trials and budget.allows_matching(shared.matching_seconds))
 
     if found.may_match and photos.lacks_points and (selects or (is_new and wanted.cameras in LEARN_FOCAL)):
         with found.timed("cameras"):
@@ -173,7 +194,7 @@ def collect_evidence(
     with found.timed("stereo"):
         dense = dense_depths(album, shared.tracks, longer_side_px=side_px or LEAST_SIDE_PX, threads=threads)
     if with_depths:
-        found.stereo_depths = stereo_depths(dense, pool, extent.training_from_scene)
+        found.stereo_depths = dense_points(dense, pool, extent.training_from_scene)
         count = len(found.stereo_depths.numbers)
         notify(f"stereo matching: the depth of {count} pixels of the training photos, {found.seconds['stereo']:.1f} s")
 
@@ -189,6 +210,24 @@ def collect_evidence(
             skies = skies or sky_masks(album, threads=threads)
             found.occluders = occluder_masks(album, dense, skies, log_gains, threads=threads)
     return found
+
+
+def _find_sensor_depths(
+    found: Evidence,
+    photos: TrainingPhotos,
+    pool: PixelPool,
+    *,
+    training_from_scene: Similarity,
+    notify: Callable[[str], None],
+) -> None:
+    """Fill in the depths of a sensor, checked with what is found already."""
+    if not any(frame.depth is not None and not frame.camera.is_spherical for frame in pool.frames):
+        return
+    with found.timed("sensor"):
+        tracks = found.track_depths or point_depths(photos.shared.tracks, pool, training_from_scene)
+        known = tracks if found.stereo_depths is None else tracks.joined(found.stereo_depths)
+        measured = sensor_depths(known, pool, training_scale=training_from_scene.scale, notify=notify)
+        found.sensor_depths = dense_points(measured, pool, training_from_scene)
 
 
 def tracks_of_model(scene: Capture, photos: Sequence[LoadedPhoto]) -> Tracks:
@@ -243,13 +282,13 @@ def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarit
     return _usable(numbers[inside], distances, trust, pool=pool)
 
 
-def stereo_depths(dense: Sequence[DenseDepth], pool: PixelPool, training_from_scene: Similarity) -> PointDepths:
-    """Return the usable pixels of a pool whose depth is known from stereo matching.
+def dense_points(dense: Sequence[DenseDepth], pool: PixelPool, training_from_scene: Similarity) -> PointDepths:
+    """Return the usable pixels of a pool whose depth is known from stereo matching or from a sensor.
 
     trust = 1 / (1 + (error / 5 %)^2)
 
     Args:
-        dense: the stereo depths of each photo of the pool.
+        dense: the depths of each photo of the pool.
     """
     widths = [frame.camera.width for frame in pool.frames]
     firsts = pool.first_pixel.tolist()

@@ -112,7 +112,7 @@ class Fitting:
                 memory_bytes=settings.field_memory_bytes,
             )
         self.field = fresh_field(size).to(device)
-        self.points = inputs.points if components.points else None
+        self.points = inputs.points if components.distance_weight else None
         gains = inputs.log_gains
         gains = torch.full((len(pool.first_pixel), 3), torch.nan) if gains is None else gains
         self.appearance = Appearance(components, pool, log_gains=gains, log_focal=inputs.log_focal)

@@ -110,6 +110,10 @@ def prepare(
             )
         if settings.model != "auto" or "points" in settings.fixed:  # else the decision on points reports it
             notify(f"points: {len(evidence.track_depths.numbers):,} pixels see a 3D point at a known distance")
+    if settings.components.sensor and (evidence.sensor_depths is None or not len(evidence.sensor_depths.numbers)):
+        raise UserError(
+            f"--with sensor: {scene.root} has no depth maps of a sensor that its photos confirm", "remove --with sensor"
+        )
     log_exposure, log_gains = _exposures(scene, settings.components, evidence, selection, notify=notify)
     return replace(
         inputs,
@@ -175,8 +179,8 @@ def _select(
 
 def _facts(photos: TrainingPhotos, settings: TrainSettings, evidence: Evidence) -> Facts:
     """Return what the selection needs to know about the scene."""
-    frames, depths = photos.scene.train_frames, (evidence.track_depths, evidence.stereo_depths)
-    points, stereo = (0 if one is None else len(one.numbers) for one in depths)
+    frames, depths = photos.scene.train_frames, (evidence.track_depths, evidence.stereo_depths, evidence.sensor_depths)
+    points, stereo, sensor = (0 if one is None else len(one.numbers) for one in depths)
     return Facts(
         settings.field,
         has_alpha=photos.album.colours.shape[-1] == 4,
@@ -186,6 +190,7 @@ def _facts(photos: TrainingPhotos, settings: TrainSettings, evidence: Evidence) 
         cameras=evidence.cameras,
         points=points,
         stereo=stereo,
+        sensor=sensor,
         sky_fraction=evidence.sky_fraction,
         sky_confirmed=evidence.sky_confirmed,
         occluded_fraction=evidence.occluded_fraction,
@@ -207,7 +212,11 @@ def _with_evidence(inputs: TrainingInputs, components: Components, evidence: Evi
     pool, occluders = inputs.pool, evidence.occluders if components.occluders else None
     if occluders is not None:
         pool = pool.without(occluders, storage=inputs.storage)
-    used = (evidence.track_depths, evidence.stereo_depths if components.stereo else None) if components.points else ()
+    used = (
+        evidence.track_depths if components.points else None,
+        evidence.stereo_depths if components.points and components.stereo else None,
+        evidence.sensor_depths if components.sensor else None,
+    )
     depths = [one.among(pool) for one in used if one is not None]
     return replace(
         inputs,

@@ -111,9 +111,8 @@ class Budget:
         return round(START_FRACTION * SEARCH_FRACTION * (self.steps or 0)) >= FEWEST_STEPS
 
     def allows_matching(self, seconds: float) -> bool:
-        """Return whether photos may be matched in this time to select components."""
-        in_time = self.seconds is None or seconds <= MATCHING_FRACTION * SEARCH_FRACTION * self.seconds
-        return self.allows_trials and in_time
+        """Return whether photos may be matched in this time before the first step."""
+        return self.seconds is None or seconds <= MATCHING_FRACTION * SEARCH_FRACTION * self.seconds
 
 
 @dataclass(frozen=True)
@@ -188,10 +187,14 @@ class Schedule:
             detail=self.detail(furthest, step),
             stride=stride(progress, step),
             threshold=FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed,
-            weights=loss_weights(self.settings.components, point_weight(progress, step, self.parallax)),
+            weights=loss_weights(self.settings.components, self.point_weight(progress, step)),
             are_emerging=progress < EMERGING_ENDS,
             cameras=camera_plan(max(0.0, progress - self.cameras_from) / (1.0 - self.cameras_from)),
         )
+
+    def point_weight(self, progress: float, step: int) -> float:
+        """Return the weight of known distances: constant with those of a sensor, which photos do not improve on."""
+        return 1.0 if self.settings.components.sensor else point_weight(progress, step, self.parallax)
 
     def learning_rate(self, progress: float, step: int) -> float:
         """Return the learning rate: linear warm-up, then half a cosine from the first to the final rate."""
@@ -266,7 +269,7 @@ def loss_weights(components: Components, point_weight: float) -> dict[str, float
     weights = {
         "colour": 1.0,
         "distortion": components.distortion,
-        "points": components.points * point_weight,
+        "points": components.distance_weight * point_weight,
         "sky": SKY_WEIGHT if components.background == "sphere" else 0.0,
         "roughness": ROUGHNESS_WEIGHT if components.background in LEARNED_BACKGROUNDS else 0.0,
     }

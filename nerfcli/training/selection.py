@@ -49,6 +49,7 @@ class Facts:
         cameras: their check against matched features; None if there is none.
         points: number of pixels that see a point at a known distance.
         stereo: number of pixels with a depth from stereo matching.
+        sensor: number of pixels with a depth from a sensor.
         sky_fraction: fraction of the pixels that look like a sky, see `matching.sky`.
         sky_confirmed: whether 3D points confirm that it is one.
         occluded_fraction: fraction of the pixels where something hides a surface that other photos see.
@@ -64,6 +65,7 @@ class Facts:
     cameras: CameraCheck | None = None
     points: int = 0
     stereo: int = 0
+    sensor: int = 0
     sky_fraction: float = 0.0
     sky_confirmed: bool = False
     occluded_fraction: float = 0.0
@@ -113,9 +115,9 @@ def with_known_cameras(requested: Components, facts: Facts) -> tuple[Components,
 def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
     """Return the model with components that photos support before any training, unless set, and the decisions.
 
-    These are points, at which rays should end, depths from stereo matching, the omission of what hides surfaces that
-    other photos see, exposures from shared pixels, and a sky that 3D points confirm. They are in the model from the
-    first step on: later, density has formed elsewhere already.
+    These are points, at which rays should end, depths from stereo matching and from a sensor, the omission of what
+    hides surfaces that other photos see, exposures from shared pixels, and a sky that 3D points confirm. They are in
+    the model from the first step on: later, density has formed elsewhere already. A sensor's depths need no good poses.
     """
     wanted: list[tuple[Change, str]] = []
     may_use = may_use_points(requested, facts.fixed, has_alpha=facts.has_alpha, cameras=facts.cameras)
@@ -129,6 +131,8 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
         if facts.exposure_spread > LIKELY_EXPOSURE_SPREAD:
             reason = f"photos differ by {_stops(facts.exposure_spread)} at the same points"
             wanted.append((("exposure", "matched" if facts.photos <= FEW_PHOTOS else "learned"), reason))
+    if facts.sensor:
+        wanted.append((("sensor", True), f"a sensor has measured the depth of {facts.sensor:,} pixels"))
     if facts.sky_confirmed:
         reason = f"{100.0 * facts.sky_fraction:.0f} % of the pixels look like a sky, with hardly any 3D point in front"
         wanted.append((("background", "sphere"), reason))

@@ -3,7 +3,7 @@
 keyframes/corrected_cameras/ID.json belongs to keyframes/corrected_images/ID.jpg: t_00 to t_23 are the first three rows
 of world_from_cam with OpenGL axes, in metres, the world's y axis up; fx, fy, cx, cy are in pixels of a picture of width
 and height. Corrected photos are undistorted, and their poses are those after loop closure; captures too large for that
-have cameras/ and images/ only.
+have cameras/ and images/ only. depth/ID.png is the LiDAR's depth in millimetres, confidence/ID.png how sure it is.
 Source: PolyCam/polyform README.md, "Polycam's data format", and polyform/convertors/instant_ngp.py.
 """
 
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
-from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, number, read_json_object, size_of
 from nerfcli.captures.formats.format import Format
@@ -55,8 +55,8 @@ def parse_polycam(folder: Path, *, images: Path | None = None) -> Capture:
     sizes = [camera.size for camera, _ in views]
     photos = find_photos(stems, (found[1],), given=images, sizes=sizes).required(str(folder), "they give the names")
     frames = [
-        Frame(image.name, camera, opencv_from_opengl_pose(pose), image=image)
-        for image, (camera, pose) in zip(photos.paths, views, strict=True)
+        Frame(image.name, camera, opencv_from_opengl_pose(pose), image=image, depth=_depth(found[0].parent, stem))
+        for stem, image, (camera, pose) in zip(stems, photos.paths, views, strict=True)
         if image is not None and pose is not None
     ]
     notes = (*photos.notes, *poses.notes())
@@ -75,6 +75,12 @@ def parse_polycam(folder: Path, *, images: Path | None = None) -> Capture:
 def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
     """Return the first three rows of world_from_cam, (3, 4)."""
     return np.array([number(record, key, where) for key in _POSE]).reshape(3, 4)
+
+
+def _depth(home: Path, stem: str) -> SensorDepth | None:
+    """Return the depth map of a frame; None if it is not on disk."""
+    confidence = home / "confidence" / f"{stem}.png"
+    return SensorDepth.found(home / "depth" / f"{stem}.png", unit=MILLIMETRE, confidence=confidence)
 
 
 def find_polycam(path: Path) -> Path | None:

@@ -6,7 +6,7 @@
 
 A pose is a 4x4 matrix, row by row, or its first three rows: world_from_cam with OpenCV axes. Intrinsics are a 3x3, 3x4
 or 4x4 matrix for the size of the photos, or as SRN writes them: a line "f cx cy 0", more lines, and last "height width"
-of the pictures that these numbers are for.
+of the pictures that these numbers are for. depth/0.png or frame-000000.depth.png is what a sensor measured, in mm.
 Source: ScanNet SensReader; Microsoft 7-Scenes readme.txt; facebookresearch/NSVF fairnr/data/data_utils.py
 (load_intrinsics, load_matrix); vsitzmann/scene-representation-networks util.py (parse_intrinsics).
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, size_of
 from nerfcli.captures.formats.format import Format
@@ -87,7 +87,9 @@ def parse_pose_files(
         if image is not None and world_from_cam is not None:
             own_camera = camera_of_size(stored_size(image, measure))
             split = _SPLITS[stem[:2]] if names_give_splits else None
-            frames.append(Frame(image.name, own_camera, world_from_cam, image=image, split=split))
+            maps = (folder / "depth" / f"{stem}.png", file.with_name(f"{stem}.depth.png"))
+            depth = SensorDepth.found(*maps, unit=MILLIMETRE)
+            frames.append(Frame(image.name, own_camera, world_from_cam, image=image, split=split, depth=depth))
     notes = (*photos.notes, *poses.notes(), *fits.notes())
     check_unique_names((frame.name for frame in frames), folder)
     return Capture(

@@ -2,7 +2,8 @@
 
 poses: a list of qx, qy, qz, qw, x, y, z for each frame: world_from_cam with OpenGL axes, in metres, the world's y axis
 up. perFrameIntrinsicCoeffs: fx, fy, cx, cy of each frame; K, column by column, is that of all frames where they are
-absent. w and h: the size of the pictures that these numbers are for. Read only.
+absent. w and h: the size of the pictures that these numbers are for. depth/0.exr, or 0.depth and 0.conf beside 0.jpg,
+are the LiDAR's depth in metres and how sure it is. Read only.
 Source: nerfstudio process_data/record3d_utils.py; record3d.app, "Format of .r3d files".
 """
 
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
-from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.frame import Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed, number, read_json_object, shown, size_of, vector
 from nerfcli.captures.formats.format import Format, has_keys, named
@@ -57,7 +58,10 @@ def parse_record3d(path: Path, *, images: Path | None = None) -> Capture:
         world_from_cam = usable.read_quaternion(str(index), place, partial(_parts, pose, place))
         if image is not None and world_from_cam is not None:
             camera = checked_camera("PINHOLE", *size, tuple(intrinsics[index]), where=where)
-            frames.append(Frame(image.name, camera, opencv_from_opengl_pose(world_from_cam), image=image))
+            pose = opencv_from_opengl_pose(world_from_cam)
+            maps = (path.parent / "depth" / f"{index}.exr", image.with_suffix(".exr"), image.with_suffix(".depth"))
+            depth = SensorDepth.found(*maps, confidence=image.with_suffix(".conf"))
+            frames.append(Frame(image.name, camera, pose, image=image, depth=depth))
     return Capture(
         tuple(frames),
         np.zeros((0, 3)),

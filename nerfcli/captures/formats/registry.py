@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from nerfcli.cameras.frame import SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import (
     alicevision,
@@ -39,7 +40,7 @@ from nerfcli.captures.formats import (
     transforms,
     tum_rgbd,
 )
-from nerfcli.captures.formats.format import Format
+from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.scene_folder import write_scene
 from nerfcli.errors import UserError, in_shell, several
 from nerfcli.photos.images import list_images
@@ -143,6 +144,21 @@ def recording(form: Format, provenance: Mapping[str, Any]) -> Format:
     if form.write is not write_scene:
         return form
     return replace(form, write=lambda capture, folder: write_scene(capture, folder, provenance=provenance))
+
+
+def depths_beside(photos: Path) -> dict[str, SensorDepth]:
+    """Return the depth maps of a sensor by the names of the photos in a folder, which is part of a capture.
+
+    A capture around it that is damaged has none.
+    """
+    home = photos.resolve()
+    try:
+        form, found = recognise(home.parent)
+        frames = form.parse(found, UserInputs()).frames
+    except UserError:
+        return {}
+    inside = [(frame.image.resolve(), frame.depth) for frame in frames if frame.image and frame.depth]
+    return {image.relative_to(home).as_posix(): depth for image, depth in inside if image.is_relative_to(home)}
 
 
 def with_masks(capture: Capture, folder: Path) -> Capture:

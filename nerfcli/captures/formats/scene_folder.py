@@ -1,11 +1,11 @@
 """A scene folder of nerfcli, as a capture: the COLMAP model sparse/0, and scene.json, nerfcli's own file beside it.
 
-scene.json states where the photos are, the split, masks and the unit of length.
+scene.json states where the photos are, the split, masks, depth maps of a sensor and the unit of length.
 """
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from nerfcli.atomic import write_json
-from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.frame import Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import parse_colmap, read_model, write_colmap_binary
 from nerfcli.captures.formats.fields import read_json_object
@@ -43,6 +43,7 @@ class Description:
         unit, unit_source: as in `Capture`.
         listed: names of frames by their use: "test", "val", or "unused" for those that the split leaves out.
         masks: the folder of the masks, or the mask of each photo that has one.
+        depths: the depth map of a sensor by the name of the frame.
         depth_bounds: nearest and farthest z by the name of the frame, in scene units; empty where they are not known.
         provenance: how the scene was made: command, settings, versions; empty if unknown.
     """
@@ -54,12 +55,16 @@ class Description:
     unit_source: str | None
     listed: Mapping[str, frozenset[str]]
     masks: Path | Mapping[str, Path] | None
+    depths: Mapping[str, SensorDepth]
     depth_bounds: Mapping[str, tuple[float, float]]
     provenance: Mapping[str, Any]
 
     def described(self, frames: Sequence[Frame]) -> tuple[Frame, ...]:
-        """Return the frames of the model with their masks and splits; the split of unused frames is None."""
-        return tuple(replace(f, mask=self._mask_of(f.name), split=self._split_of(f.name)) for f in frames)
+        """Return the frames of the model with their masks, depths and splits; the split of unused frames is None."""
+        return tuple(
+            replace(f, mask=self._mask_of(f.name), depth=self.depths.get(f.name), split=self._split_of(f.name))
+            for f in frames
+        )
 
     def bounds_of(self, frames: Sequence[Frame]) -> np.ndarray | None:
         """Return the nearest and farthest z of frames, (frames, 2), if the file gives them for all of the frames."""
@@ -123,6 +128,7 @@ def read_description(root: Path) -> Description:
         unit_source=source if isinstance(source, str) else None,
         listed=_listed_names(content, path),
         masks=masks,
+        depths=_listed_depths(content, path, place),
         depth_bounds=_listed_bounds(content, path),
         provenance=provenance if isinstance(provenance, dict) else {},
     )
@@ -136,6 +142,7 @@ def save(
     unit: str = "arbitrary",
     unit_source: str | None = None,
     masks: Path | Mapping[str, Path] | None = None,
+    depths: Mapping[str, SensorDepth] | None = None,
     split: Mapping[str, str | None] | None = None,
     depth_bounds: Mapping[str, tuple[float, float]] | None = None,
 ) -> None:
@@ -148,6 +155,7 @@ def save(
         unit: "arbitrary" or "metre".
         unit_source: source of the metric scale.
         masks: a folder of masks, named as in `photos.masks.find_mask`; or masks by the name of the photo.
+        depths: depth maps of a sensor by the name of the photo.
         split: "train", "test", "val" or None (unused) by the name of the photo; by default every 8th is held out.
         depth_bounds: nearest and farthest z by name, in scene units, if they are known without points.
 
@@ -174,6 +182,7 @@ def save(
         "model": MODEL_FOLDER,
         "split": parts,
         "masks": mask_entry,
+        **({"depths": {name: _depth_entry(depth, scene_dir) for name, depth in depths.items()}} if depths else {}),
         "unit": unit,
         "unit_source": unit_source,
         "frame_from_world": None,
@@ -205,6 +214,30 @@ def _listed_names(content: dict[str, Any], path: Path) -> dict[str, frozenset[st
             raise UserError(what, 'expected "split": {"test": ["a.jpg", ...]}')
         names[part] = frozenset(listed)
     return names
+
+
+def _depth_entry(depth: SensorDepth, folder: Path) -> dict[str, Any]:
+    """Return a depth map as an entry of scene.json."""
+    confidence = None if depth.confidence is None else seen_from(folder, depth.confidence.resolve())
+    return {"path": seen_from(folder, depth.path.resolve()), "unit": depth.unit, "confidence": confidence}
+
+
+def _listed_depths(content: dict[str, Any], path: Path, place: Callable[[str], Path]) -> dict[str, SensorDepth]:
+    listed = content.get("depths") or {}
+    try:
+        return {
+            name: SensorDepth(
+                place(one["path"]),
+                float(one["unit"]),
+                None if one["confidence"] is None else place(one["confidence"]),
+            )
+            for name, one in dict(listed).items()
+        }
+    except (TypeError, ValueError, KeyError, OverflowError) as error:
+        raise UserError(
+            f"{path}: depths are not the depth maps of photos",
+            'expected {"a.jpg": {"path": "a.png", "unit": 0.001, "confidence": null}, ...}',
+        ) from error
 
 
 def _listed_bounds(content: dict[str, Any], path: Path) -> dict[str, tuple[float, float]]:
@@ -287,6 +320,7 @@ def write_scene(capture: Capture, folder: Path, *, provenance: Mapping[str, Any]
         unit=capture.unit,
         unit_source=capture.unit_source,
         masks={frame.name: frame.mask for frame in capture.frames if frame.mask is not None},
+        depths={frame.name: frame.depth for frame in capture.frames if frame.depth is not None},
         split=split if {"test", "val"} & set(split.values()) else None,
         depth_bounds=bounds,
     )

@@ -15,7 +15,7 @@ import numpy as np
 from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose, opengl_from_opencv_pose
-from nerfcli.cameras.frame import Frame, Size
+from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth, Size
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.alicevision import find_alicevision
 from nerfcli.captures.formats.camera_path import find_camera_path
@@ -66,8 +66,10 @@ def parse_transforms(path: Path, measure: Measure | None = None, *, images: Path
 
 def losses_transforms(capture: Capture) -> tuple[str, ...]:
     """List the parts of a capture that a transforms.json cannot hold. Points go into a PLY file next to it."""
-    parts = lost_parts(capture, holds=("masks", "points", "colours", "splits"))
-    return (*lost_of_cameras(capture, lost_to_transforms), *parts)
+    parts = lost_parts(capture, holds=("masks", "depths", "points", "colours", "splits"))
+    others = sum(frame.depth is not None and frame.depth.unit != MILLIMETRE for frame in capture.frames)
+    depths = (f"{several(others, 'depth map')} in another unit than millimetres",) if others else ()
+    return (*lost_of_cameras(capture, lost_to_transforms), *parts, *depths)
 
 
 def write_transforms(capture: Capture, path: Path) -> None:
@@ -95,6 +97,8 @@ def write_transforms(capture: Capture, path: Path) -> None:
         record["file_path"] = file_path
         if frame.mask is not None:
             record["mask_path"] = seen_from(path.parent, frame.mask)
+        if frame.depth is not None and frame.depth.unit == MILLIMETRE:
+            record["depth_file_path"] = seen_from(path.parent, frame.depth.path)
         record["transform_matrix"] = opengl_from_opencv_pose(frame.world_from_cam).tolist()
         records.append(record)
     cloud = path.with_name(f"{path.stem}_points.ply")
@@ -172,10 +176,9 @@ def listed_frames(
         if matrix is None:
             continue
         camera, pose = camera_of_record(record, own_size, where, fits), opencv_from_opengl_pose(matrix)
-        split = splits.get(plain_name(texts[index]))
-        frames.append(
-            Frame(names[index], cameras.setdefault(camera, camera), pose, places[index], masks[index], split=split)
-        )
+        split, depth = splits.get(plain_name(texts[index])), _listed_depth(path.parent, record, where)
+        camera = cameras.setdefault(camera, camera)
+        frames.append(Frame(names[index], camera, pose, places[index], masks[index], split=split, depth=depth))
     return frames, missing, (*found.notes, *poses.notes(), *fits.notes(), *lost_masks)
 
 
@@ -192,6 +195,14 @@ def _masks(
     lost = sorted(name for name in named if paths.get(name) is None)
     notes = (f"{several(len(lost), 'mask')} left out, which {path.name} names and do not exist: {listed(lost)}",)
     return [paths.get(mask) if mask else None for mask in texts], notes if lost else ()
+
+
+def _listed_depth(folder: Path, record: dict[str, Any], where: str) -> SensorDepth | None:
+    """Return the depth map of a frame, in nerfstudio's default unit; None if it has none on disk."""
+    listed = record.get("depth_file_path")
+    if listed is not None and not isinstance(listed, str):
+        raise malformed(where, f"depth_file_path is {listed!r:.80}", "expected the path of a depth map as text")
+    return SensorDepth.found(folder / listed.replace("\\", "/"), unit=MILLIMETRE) if listed else None
 
 
 def relative_path(frame: Frame, folder: Path) -> str:

@@ -15,14 +15,15 @@ def lost_parts(capture: Capture, *, holds: Collection[str]) -> list[str]:
     """List the losses beyond cameras and poses of a capture.
 
     Args:
-        holds: the parts that the format has a place for: "masks", "points", "colours", "observations", "splits",
-            "depth bounds", "unit".
+        holds: the parts that the format has a place for: "masks", "depths", "points", "colours", "observations",
+            "splits", "depth bounds", "unit".
     """
     num_points = len(capture.points)
     num_observations = 0 if capture.observations is None else len(capture.observations.pixels)
     num_split = sum(frame.split is not None for frame in capture.frames)
     parts = {
         "masks": (num := sum(frame.mask is not None for frame in capture.frames), f"{num} masks"),
+        "depths": (num := sum(frame.depth is not None for frame in capture.frames), f"{num} depth maps of a sensor"),
         "points": (num_points, f"{num_points} points"),
         "colours": (num_points if capture.colours is not None else 0, f"colours of {num_points} points"),
         "observations": (num_observations, f"{num_observations} observations"),

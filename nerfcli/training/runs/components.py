@@ -20,6 +20,8 @@ BACKGROUNDS = ("auto", "black", "constant", "random", "sphere")
 LEARNED_BACKGROUNDS = ("constant", "sphere")
 EXPOSURES = ("none", "exif", "matched", "learned")
 CAMERAS = ("fixed", "poses", "focal", "all")
+# Weight of known distances where they are used.
+POINT_WEIGHT = 0.1
 # Meaning of black in a mask: unknown, or empty space.
 MASKS = ("ignore", "empty")
 # Components of earlier versions, each with the value that switched it off.
@@ -45,6 +47,7 @@ class Components:
         points: weight of known distances, see `training.losses.emerging_losses`.
         stereo: whether the points include pixels of training photos with a depth from stereo matching, see
             `matching.stereo`.
+        sensor: whether the depths of a sensor are known distances, see `training.sensor_depths`.
         near: whether gradients near a camera are scaled down; see `reference.scale_gradients`.
         distortion: weight of `kernels.RaySums.distortion`; 0.05 is best or as good as any on real and synthetic
             captures.
@@ -60,10 +63,16 @@ class Components:
     masks: str = "ignore"
     points: float = 0.0
     stereo: bool = False
+    sensor: bool = False
     near: bool = True
     distortion: float = 0.05
     antialias: bool = False
     occluders: bool = False
+
+    @property
+    def distance_weight(self) -> float:
+        """Weight of known distances: those of a sensor count as much without points as with them by default."""
+        return self.points or (POINT_WEIGHT if self.sensor else 0.0)
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "Components":
@@ -132,8 +141,9 @@ CHOICES = {
     "exposure": Choice("none", "learned", EXPOSURES),
     "cameras": Choice("fixed", "poses", CAMERAS),
     "masks": Choice("ignore", "empty", MASKS),
-    "points": Choice(0.0, 0.1, None),
+    "points": Choice(0.0, POINT_WEIGHT, None),
     "stereo": Choice(False, True, (False, True)),
+    "sensor": Choice(False, True, (False, True)),
     "near": Choice(False, True, (False, True)),
     "distortion": Choice(0.0, 0.05, None),
     "antialias": Choice(False, True, (False, True)),
