@@ -483,3 +483,26 @@ class TestScanNetPp:
         frames = [{"file_path": "a.jpg", "transform_matrix": matrix.tolist()}]
         text(tmp_path / "transforms.json", json.dumps({"w": 64, "h": 48, "fl_x": 70, "frames": frames}))
         assert recognise(tmp_path)[0].name == "transforms"
+
+
+@pytest.mark.parametrize(
+    ("name", "depth", "confidence", "unit"),
+    [
+        ("stray-scanner", "depth/00000{}.png", "confidence/00000{}.png", 1e-3),
+        ("3d-scanner-app", "depth_0000{}.png", "conf_0000{}.png", 1e-3),
+        ("tum-rgbd", "depth/{}.png", None, 1 / 5000),
+    ],
+)
+def test_depth_maps_of_sensors_are_found_with_their_unit_and_confidence(tmp_path, name, depth, confidence, unit):
+    """One of the first two photos has a depth map; in TUM's lists by time, 10 ms away, where 20 ms count."""
+    WITH_PHOTOS[name](VIEWS, tmp_path)
+    if name == "tum-rgbd":
+        text(tmp_path / "depth.txt", f"# depth maps\n{1305031100.26!r} depth/0.png\n{1305031100.29!r} depth/9.png\n")
+    maps = [tmp_path / path.format(0) for path in (depth, confidence) if path]
+    for path in maps:
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    first, second = (frame.depth for frame in parse(tmp_path).frames)
+    assert first is not None
+    assert (first.path, first.unit, first.confidence) == (maps[0], unit, maps[1] if confidence else None)
+    assert second is None

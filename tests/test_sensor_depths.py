@@ -31,7 +31,6 @@ from nerfcli.captures.formats.transforms import losses_transforms, parse_transfo
 from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import UserError
 from nerfcli.matching.stereo import DenseDepth
-from nerfcli.photos.images import list_images
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.photos.sensor_depth import read_sensor_depth
 from nerfcli.training import sensor_depths as module
@@ -355,14 +354,14 @@ def test_formats_name_the_maps_of_their_photos(tmp_path):
     """The layouts of polyform's README, Record3D's two exports, ScanNet and 7-Scenes."""
     home = write_polycam(VIEWS, tmp_path / "polycam").parent.parent
     depth, sure = put_map(home / "depth/1000.png"), put_map(home / "confidence/1000.png")
-    frames = parse_polycam(tmp_path / "polycam", list_images).frames
+    frames = parse_polycam(tmp_path / "polycam").frames
     assert [frame.depth for frame in frames] == [SensorDepth(depth, 1e-3, sure), None]
 
     file = write_record3d(VIEWS, tmp_path / "record3d")
     depth = put_map(file.parent / "depth/1.exr")
-    assert [frame.depth for frame in parse_record3d(file, list_images).frames] == [None, SensorDepth(depth)]
+    assert [frame.depth for frame in parse_record3d(file).frames] == [None, SensorDepth(depth)]
     raw, sure = put_map(file.parent / "rgb/0.depth"), put_map(file.parent / "rgb/0.conf")
-    assert parse_record3d(file, list_images).frames[0].depth == SensorDepth(raw, 1.0, sure)
+    assert parse_record3d(file).frames[0].depth == SensorDepth(raw, 1.0, sure)
 
     for stem, pose, image, where in (
         ("0", "pose/0.txt", "color/0.png", "depth/0.png"),
@@ -374,7 +373,7 @@ def test_formats_name_the_maps_of_their_photos(tmp_path):
         (folder / pose).parent.mkdir(exist_ok=True)
         np.savetxt(folder / pose, np.eye(4))
         np.savetxt(folder / "intrinsics.txt", VIEWS.matrix)
-        capture = parse_pose_files(folder, measure, list_images)
+        capture = parse_pose_files(folder, measure)
         assert [frame.depth for frame in capture.frames] == [SensorDepth(depth, 1e-3)]
         if "color/" in image:
             assert depths_beside(folder / "color") == {"0.png": SensorDepth(depth, 1e-3)}

@@ -25,10 +25,9 @@ from nerfcli.errors import UserError
 HEIC_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
 # What every program reads; beside such a picture, one of the same name in another format is the same photo, converted.
 _USUAL_SUFFIXES = frozenset({".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".webp", ".bmp"})
-_JPEG_2000_SUFFIXES = frozenset({".jp2", ".j2k", ".jpx", ".jpf", ".jpc", ".j2c"})
-_NETPBM_SUFFIXES = frozenset({".ppm", ".pgm", ".pbm", ".pnm"})
-# Which other programs often cannot read.
-UNUSUAL_SUFFIXES = HEIC_SUFFIXES | _JPEG_2000_SUFFIXES | _NETPBM_SUFFIXES | {".avif", ".gif", ".mpo", ".tga"}
+# Which other programs often cannot read; JPEG 2000 and PNM have several each.
+_OTHER_SUFFIXES = {".avif", ".gif", ".mpo", ".tga", ".jp2", ".j2k", ".jpx", ".jpf", ".jpc", ".j2c"}
+UNUSUAL_SUFFIXES = HEIC_SUFFIXES | _OTHER_SUFFIXES | {".ppm", ".pgm", ".pbm", ".pnm"}
 IMAGE_SUFFIXES = _USUAL_SUFFIXES | UNUSUAL_SUFFIXES
 
 # Pillow now opens HEIC, too: upright, as the file itself says, and with an EXIF orientation of 1.
@@ -70,10 +69,9 @@ _UNREAD = {
     ".jxl": "is a JPEG XL file: convert it to JPEG",
     ".insp": "holds the two circles of a 360-degree camera: export it as one equirectangular picture",
 }
-# Files in a folder of photos that are nobody's photos: our list of a video's frames, and what systems leave behind.
+# Files that are not counted among skipped ones: our list of a video's frames, and what systems leave behind.
 _OURS_OR_SYSTEM = frozenset({"frames.json", "Thumbs.db", "desktop.ini"})
-# The tag of a TIFF that says what its samples are, and its value for float.
-_SAMPLE_FORMAT, _FLOAT_SAMPLES = 339, 3
+_SAMPLE_FORMAT, _FLOAT_SAMPLES = 339, 3  # a tag of TIFF, and its value for float
 
 
 def list_images(folder: Path) -> list[Path]:

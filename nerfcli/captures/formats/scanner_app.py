@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
-from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed, read_json_object, vector
 from nerfcli.captures.formats.format import Format, has_keys
@@ -57,7 +57,9 @@ def parse_scanner_app(folder: Path, measure: Measure, *, images: Path | None = N
         camera = fits.matrix(matrix, stored_size(image, measure), f"{where}: intrinsics")
         pose = poses.read(image.name, f"{where}: {_POSE}", partial(_matrix, record, where))
         if pose is not None:
-            frames.append(Frame(image.name, camera, opencv_from_opengl_pose(pose), image=image))
+            depth, confidence = (folder / f"{path.stem.replace('frame', kind)}.png" for kind in ("depth", "conf"))
+            found_depth = SensorDepth.found(depth, unit=MILLIMETRE, confidence=confidence)
+            frames.append(Frame(image.name, camera, opencv_from_opengl_pose(pose), image=image, depth=found_depth))
     notes = (*found.notes, *poses.notes(), *fits.notes())
     if without:
         notes += (f"{len(frames)} of the {len(files)} frames with a pose have a photo",)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfcli.cameras.frame import Frame, Size
+from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth, Size
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text
 from nerfcli.captures.formats.format import Format
@@ -59,7 +59,9 @@ def parse_stray_scanner(folder: Path, measure: Measure, *, images: Path | None =
         pose = np.array([row[key] for key in _POSE])
         camera = fits.matrix(matrix, size, where if has_lenses else str(folder / MATRIX))
         world_from_cam = quaternion_pose(pose[:4], pose[4:], where)
-        frames.append(Frame(name if image is None else image.name, camera, world_from_cam, image=image))
+        maps, number = folder / "depth", f"{int(row['frame']):06d}.png"
+        depth = SensorDepth.found(maps / number, unit=MILLIMETRE, confidence=folder / "confidence" / number)
+        frames.append(Frame(name if image is None else image.name, camera, world_from_cam, image=image, depth=depth))
     check_unique_names((frame.name for frame in frames), path)
     notes = (*found.notes, *fits.notes())
     if there and len(there) < len(rows):

@@ -14,19 +14,21 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.frame import Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, numbers, read_text
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, find_photos
-from nerfcli.captures.formats.timed_poses import poses_at
+from nerfcli.captures.formats.timed_poses import MOST_AWAY_SECONDS, poses_at
 from nerfcli.captures.formats.trajectories import timed_lines, tum_poses
 from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import UserError, listed, several
 
-PHOTOS, TRUTH = "rgb.txt", "groundtruth.txt"
+PHOTOS, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
+# Metres of a level in depth maps.
+_UNIT = 1 / 5000
 
 # fx, fy, cx, cy, k1, k2, p1, p2, k3 of the colour cameras; the photos of freiburg3 are undistorted.
 _KINECTS = {
@@ -51,12 +53,7 @@ def parse_tum_rgbd(
         UserError: a file is damaged (file and line are named), no photo has a pose, or the camera is not known.
     """
     path = folder / PHOTOS
-    seconds, names = [], []
-    for line_number, line in timed_lines(read_text(path, "expected lines of timestamp and file")):
-        where = f"{path}: line {line_number}"
-        time, _, file = line.strip().partition(" ")
-        seconds += numbers([time], 1, where)
-        names.append(name_of(file, where))
+    seconds, names = _files_in_time(path)
     check_unique_names(names, path)
     poses, lost = tum_poses(folder / TRUTH)
     times = np.array([float(name) for name, _ in poses])
@@ -68,8 +65,9 @@ def parse_tum_rgbd(
     there = [image for image in found.paths if image is not None]
     size = stored_size(there[0], measure) if there else _KINECT_SIZE
     camera = _own_camera(folder, size) if camera is None else camera.resized(*size)
+    depths = _depths(folder, seconds)
     frames = tuple(
-        Frame(name, camera, interpolated[index], image=image or (images or folder) / name)
+        Frame(name, camera, interpolated[index], image=image or (images or folder) / name, depth=depths[index])
         for index, name, image in zip(kept, found.names, found.paths, strict=True)
     )
     notes = (*found.notes, *lost)
@@ -77,6 +75,30 @@ def parse_tum_rgbd(
         notes += (f"{several(len(unposed), 'photo')} left out, as no pose is near in time: {listed(unposed)}",)
     points, source = np.zeros((0, 3)), "motion capture (TUM RGB-D)"
     return Capture(frames, points, kind="tum-rgbd", unit="metre", unit_source=source, notes=notes)
+
+
+def _files_in_time(path: Path) -> tuple[list[float], list[str]]:
+    """Return the times and the files that a list names."""
+    seconds, names = [], []
+    for line_number, line in timed_lines(read_text(path, "expected lines of timestamp and file")):
+        where = f"{path}: line {line_number}"
+        time, _, file = line.strip().partition(" ")
+        seconds += numbers([time], 1, where)
+        names.append(name_of(file, where))
+    return seconds, names
+
+
+def _depths(folder: Path, seconds: list[float]) -> list[SensorDepth | None]:
+    """Return the depth map that was taken with the photo of each time; None where there is none."""
+    path = folder / DEPTHS
+    times, names = _files_in_time(path) if path.is_file() else ([], [])
+
+    def nearest(time: float) -> SensorDepth | None:
+        away = np.abs(np.subtract(times, time))
+        index = int(away.argmin())
+        return SensorDepth.found(folder / names[index], unit=_UNIT) if away[index] <= MOST_AWAY_SECONDS else None
+
+    return [nearest(time) if names else None for time in seconds]
 
 
 def _own_camera(folder: Path, size: tuple[int, int]) -> Camera:
