@@ -200,7 +200,7 @@ def test_render_writes_the_proportion_of_depths_within_the_tolerance(copied, tmp
     assert "confidence, in fractions of 1: the proportion of depths" in nerfcli("info", path).stdout
     preview = nerfcli("info", path.with_suffix(".png")).stdout
     assert "confidence: proportion of depths with an error of at most 2 %" in meta.title
-    assert "range=0.0 1.0" in preview
+    assert 'range={"low": 0.0, "high": 1.0, "inverse": false}' in preview
     assert "is kept: it is complete" in nerfcli(*common, *outputs).stderr
 
 

@@ -200,7 +200,7 @@ def test_what_matches_no_photo_is_reported():
         ),
         ("poses.txt", "0 1 2 3 0 0 0 1\n" * 3, "poses.txt has no cameras"),
         ("cameras.txt", "1 PINHOLE 64 40 50 50 32 20\n", "has no camera for photo photo 0.jpg of 64x48"),
-        ("cameras.txt", "1 EQUIRECTANGULAR 64 48 64 48\n", "has a spherical camera of 64x48 pixels"),
+        ("cameras.txt", "1 EQUIRECTANGULAR 64 48 64 48\n", "invalid size of an EQUIRECTANGULAR picture: 64x48"),
     ],
 )
 def test_files_that_are_of_no_use_are_bad_input(tmp_path: Path, name: str, content: str, said: str):
