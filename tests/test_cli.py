@@ -832,3 +832,13 @@ def test_ctrl_c_and_sigterm_save_a_checkpoint_and_say_how_to_go_on(stopped, exit
     assert resumed.exit_code == 0, resumed.stderr
     assert f"resumed at step {trained['step']}, " in resumed.stderr
     assert read_log(run)[-1]["step"] == trained["step"] + 2
+
+
+def test_every_message_of_the_guide_to_failures_is_in_the_program():
+    """The parts of a message between what varies, which the guide writes as "..."."""
+    guide = (PROJECT / "docs/when-it-goes-wrong.md").read_text(encoding="utf-8")
+    messages = re.findall(r"^\| `([^`]+)` \|", guide, re.M)
+    source = "".join(path.read_text(encoding="utf-8") for path in (PROJECT / "nerfcli").rglob("*.py"))
+    assert len(messages) >= 20
+    parts = [part.strip() for message in messages for part in message.split("...") if len(part.strip()) > 6]
+    assert [part for part in parts if part not in source] == []
