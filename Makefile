@@ -2,6 +2,7 @@
 #   make demo    photos of a desk -> poses, field, numbers, depth maps and a flight around it, in demo/
 #   make test    what CI runs: format, lint, types, tests
 #   make test-slow    the long tests, and 2,000 examples of every property
+#   make release    wheel and sdist in dist/, installed in a fresh environment and tried on six photos there
 #   make clean   remove .venv, demo/ and all caches
 # Demo and test make .venv first, once. With a Python of your choice: make test PYTHON=/opt/python/bin/python3.13
 
@@ -11,7 +12,7 @@ BIN = .venv/bin
 PIP_INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow clean
+.PHONY: demo test test-slow release clean
 
 demo: .venv/installed
 	$(BIN)/nerfcli run sample_scenes/desk/images -o demo --budget 90s --downscale 2
@@ -33,6 +34,16 @@ test: .venv/installed-dev
 
 test-slow: .venv/installed-dev
 	$(BIN)/pytest -n 2 --dist worksteal -m 'slow or hypothesis' --hypothesis-profile=thorough
+
+release: .venv/installed-dev
+	rm -rf dist build release-check
+	$(PIP_INSTALL) build
+	$(BIN)/python -m build --quiet
+	$(BIN)/python -m venv release-check/env
+	release-check/env/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt dist/nerfcli-*.whl
+	mkdir release-check/photos && cp sample_scenes/desk/images/desk_00[0-5].jpg release-check/photos
+	cd release-check && env/bin/nerfcli --version && env/bin/nerfcli run photos --budget 10s
+	du -sh dist/* release-check/env
 
 .venv/installed: $(BIN)/python pyproject.toml constraints.txt
 	$(PIP_INSTALL) -e .
@@ -61,5 +72,5 @@ $(BIN)/python:
 	echo "Python 3.11 or newer is needed;$${found:- none found;} name one with PYTHON=/path/to/python" >&2; exit 1
 
 clean:
-	rm -rf .venv demo build dist nerfcli.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv demo build dist release-check nerfcli.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
