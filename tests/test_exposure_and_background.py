@@ -339,7 +339,7 @@ def test_empty_space_shows_the_background_by_direction_whatever_the_tile(capture
     assert isinstance(model.background, SphereBackground)
     with torch.no_grad():
         model.background.logits.copy_(torch.randn_like(model.background.logits))
-    empty = replace(model, occupied=torch.zeros_like(model.occupied))
+    empty = replace(model, occupied=torch.zeros_like(model.occupied), fine=None)
     frame = capture.frames[1]
     picture = render_picture(empty, frame, background=empty.background)
     bearings = torch.from_numpy(CAMERA.pixel_bearings()[0]).float()  # the camera's axes are those of the world

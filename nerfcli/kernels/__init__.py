@@ -33,7 +33,7 @@ from nerfcli.kernels.interface import (
     RayTermination,
     Targets,
 )
-from nerfcli.kernels.reference import ray_indices, sum_along_rays
+from nerfcli.kernels.reference import distances_to_occupied, ray_indices, sum_along_rays
 from nerfcli.kernels.reference.backend import ReferenceBackend
 from nerfcli.version import __version__
 
@@ -55,6 +55,7 @@ __all__ = [
     "backend_for",
     "contract",
     "describe_machine",
+    "distances_to_occupied",
     "driver_version",
     "gpu_launcher",
     "grid_coordinates",

@@ -51,6 +51,8 @@ class March(NamedTuple):
         contraction: see `grid_coordinates`; outside the cube of a bounded scene nothing is occupied.
         max_optical_depth: > 0; each ray ends at the sample where its optical depth reaches this.
         least_weight: >= 0; samples that absorb a smaller fraction of their ray's light may be left out, but never all.
+        distances: `reference.distances_to_occupied` of `occupied`, to skip empty space faster; None if that is not
+            worth while.
     """
 
     edges: Tensor
@@ -58,6 +60,7 @@ class March(NamedTuple):
     contraction: str
     max_optical_depth: float
     least_weight: float = 0.0
+    distances: Tensor | None = None
 
 
 class HashGrid(NamedTuple):

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from nerfcli.cameras.frame import Frame
@@ -21,7 +23,7 @@ from nerfcli.render.trained_field import Marching, TrainedField
 FORMAT = "nerfcli field 2"
 # Format without a choice of contractions; still read.
 FORMAT_1 = "nerfcli field 1"
-BACKGROUND = "background.logits"
+BACKGROUND, FINE = "background.logits", "fine"
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ def save_model(path: Path, model: Model) -> None:
     behind, tensors = model.background, {**model.field.state_dict(), "occupied": model.occupied}
     if isinstance(behind, SphereBackground):
         tensors[BACKGROUND] = behind.logits
+    if model.fine is not None:
+        tensors[FINE] = torch.from_numpy(np.packbits(model.fine.cpu().numpy().reshape(len(model.fine), -1), axis=1))
     description: dict[str, Any] = {
         "format": FORMAT,
         "field": model.field.settings.to_json(),
@@ -72,7 +76,10 @@ def load_model(path: Path, device: str) -> Model:
             f"{path} is of format {description.get('format')!r}, expected {FORMAT!r}",
             "train again with this version of nerfcli",
         )
-    occupied = tensors.pop("occupied")
+    occupied, fine = tensors.pop("occupied"), tensors.pop(FINE, None)
+    if fine is not None:
+        bits = np.unpackbits(fine.cpu().numpy(), axis=1)
+        fine = torch.from_numpy(bits.view(bool).reshape([len(bits)] * 3)).to(device)
     refuse_non_finite(tensors, path)
     background = _background(description["background"], tensors)
     field = fresh_field(settings_from_json(description["field"])).to(device)
@@ -90,6 +97,7 @@ def load_model(path: Path, device: str) -> Model:
         exposures={name: tuple(gains) for name, gains in description.get("exposures", {}).items()},
         beyond_exif={name: tuple(gains) for name, gains in description.get("beyond_exif", {}).items()},
         sha256=hashlib.sha256(content).hexdigest(),
+        fine=fine,
     )
 
 

@@ -124,7 +124,7 @@ def render_rays(
     field, cuts = model.field, uniform_cuts(model.marching).to(directions) if cuts is None else cuts
     edges = torch.cat([cuts, cuts[-1:]])  # the last edge is not used, because there is no jitter
     rays = Rays(origins, directions, torch.zeros_like(directions[:, 0]), cones)
-    march = March(edges, model.occupied, model.contraction, deepest(tolerance))
+    march = March(edges, model.open_cells, model.contraction, deepest(tolerance), distances=model.distances)
     # All negligible samples of a ray together use at most the rest of the tolerance.
     negligible = (1.0 - STOP_FRACTION) * tolerance / UNSEEN
     return field.backend.trace_rays(

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import torch
@@ -13,6 +14,7 @@ from nerfcli import kernels
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.field.background import Background
 from nerfcli.field.interface import Field
+from nerfcli.kernels import distances_to_occupied
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,7 @@ class TrainedField:
     Args:
         field: the radiance field, on points of the training frame.
         occupied: (G, G, G) bool over the field's unit cube.
+        fine: the same over a finer grid, see `training.fine_cells`; None for models without.
         marching: the steps along rays.
         background: sRGB behind everything, for pictures without alpha.
         training_from_scene: normalisation of the scene to the training frame.
@@ -90,6 +93,17 @@ class TrainedField:
     exposures: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
     beyond_exif: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
     sha256: str | None = None
+    fine: Tensor | None = None
+
+    @property
+    def open_cells(self) -> Tensor:
+        """The cells that rays of pictures sample, of the finer grid if there is one."""
+        return self.occupied if self.fine is None else self.fine
+
+    @cached_property
+    def distances(self) -> Tensor:
+        """The distances to open cells, for `kernels.March`."""
+        return distances_to_occupied(self.open_cells.cpu())
 
     @property
     def contraction(self) -> str:

@@ -25,6 +25,7 @@ from nerfcli.errors import UserError
 from nerfcli.field.background import colours_behind
 from nerfcli.field.checkpoint import load_tensors, refuse_non_finite, save_tensors
 from nerfcli.field.exposure import exposed
+from nerfcli.field.hash_field import HashField
 from nerfcli.field.kinds import settings_from_json
 from nerfcli.photos.colours import psnr_of
 from nerfcli.photos.exif import log_exposures
@@ -34,6 +35,7 @@ from nerfcli.render.model import Model, load_model, save_model
 from nerfcli.render.tracing import render_rays
 from nerfcli.training.appearance import over_background
 from nerfcli.training.extent import Extent
+from nerfcli.training.fine_cells import with_fine_cells
 from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.pool import PixelPool, load_album
 from nerfcli.training.preparation import EarlierDecisions
@@ -135,19 +137,28 @@ class Checkpoints:
 
         Of several processes that train together, the first one does.
         """
-        if distributed.rank() > 0:
-            return
+        if distributed.rank() == 0:
+            self._write(self.model())
+
+    def finish(self) -> None:
+        """Write the files after the last step, with what makes pictures of a hash grid faster."""
+        if distributed.rank() == 0:
+            model = self.model()
+            is_fast = isinstance(model.field, HashField)
+            self._write(with_fine_cells(model, self.frames()[0]) if is_fast else model)
+
+    def _write(self, model: Model) -> None:
         tensors, description = self._fitting.state()
         extent = self._inputs.extent.to_json()
         description |= {"format": STATE_FORMAT, "extent": extent, "totals": vars(self._totals)}
-        writing = [self._write_field, lambda: save_tensors(self._run / STATE, tensors, description)]
+        writing = [lambda: self._write_field(model), lambda: save_tensors(self._run / STATE, tensors, description)]
         # The process may be killed between the two. The state is all that resuming needs and must never be ahead of the
         # field. The first time it is written first, so that no field exists that can neither be resumed nor replaced.
         for write in writing if (self._run / FIELD).exists() else reversed(writing):
             write()
 
-    def _write_field(self) -> None:
-        save_model(self._run / FIELD, self.model())
+    def _write_field(self, model: Model) -> None:
+        save_model(self._run / FIELD, model)
         if self._fitting.appearance.cameras is not None:
             self.write_cameras()
 

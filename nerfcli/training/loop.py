@@ -159,7 +159,7 @@ def train(
             if error.exit_code == LOST_RANK:  # nothing has been learned from that step
                 checkpoints.write()
             raise
-        checkpoints.write()
+        checkpoints.finish()
     if fitting.rollbacks:
         notify(f"numbers became non-finite {fitting.rollbacks} times; the states before that are in {run}/failure-*")
     if distributed.rank() == 0:

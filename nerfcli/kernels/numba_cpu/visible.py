@@ -23,21 +23,11 @@ from nerfcli.kernels.numba_cpu.threads import use_threads
 LANES = 256
 AHEAD = 4
 ROUND = LANES * AHEAD
+# Rounding of positions and distances in float32 must not skip a cell.
+_ROUNDED_DOWN = np.float32(0.999)
 # Room for the samples of each thread, 92 MB; if there are more, all are found again with room for every step of every
 # ray. That would be up to 1.7 GB in each step, and trainings would keep the pages that any of them has touched.
 USUAL_SAMPLES = 2**19
-
-
-@numba.njit(inline="always")
-def _block_side(side: Any) -> Any:
-    """Return the width, in cells, of the blocks that are skipped as a whole if they are empty."""
-    return max(side // 16, 4)
-
-
-@numba.njit(inline="always")
-def _block(x: Any, side: Any) -> Any:
-    """Return the block of a coordinate along one axis; the coordinate is clamped to the cube."""
-    return min(np.int64(min(max(x, np.float32(0)), np.float32(1)) * np.float32(side)), side - 1) // _block_side(side)
 
 
 @numba.njit(nogil=True, error_model="numpy")
@@ -52,45 +42,72 @@ def _is_occupied(occupied: Any, z: Any, y: Any, x: Any, width: Any) -> Any:
     return False
 
 
+@numba.njit(inline="always")
+def _block_width(side: Any, blocks: Any) -> Any:
+    """Return the width in cells of each of `blocks` that share an axis of `side` cells."""
+    return -(-side // blocks)
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def occupied_blocks(occupied: Any) -> Any:
-    """Return a mask of the blocks that have an occupied cell, or touch a block that has one."""
+def nearby_blocks(occupied: Any) -> Any:
+    """Return the distance from each block of cells to the nearest that has an occupied cell: 0, 1, or 2 for more.
+
+    Far less exact than `kernels.distances_to_occupied`, and fast enough for every step of a training.
+    """
     side = occupied.shape[0]
-    width = _block_side(side)
-    blocks = (side + width - 1) // width
-    own = np.zeros((blocks, blocks, blocks), np.bool_)
+    blocks = -(-side // max(side // 16, 4))
+    width = _block_width(side, blocks)
+    distance = np.full((blocks, blocks, blocks), 2, np.uint8)
     for z in range(blocks):
         for y in range(blocks):
             for x in range(blocks):
-                own[z, y, x] = _is_occupied(occupied, z * width, y * width, x * width, width)
-    near = np.zeros_like(own)
-    for z in range(blocks):
-        for y in range(blocks):
-            for x in range(blocks):
-                if own[z, y, x]:
-                    near[max(z - 1, 0) : z + 2, max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2] = True
-    return near
+                if _is_occupied(occupied, z * width, y * width, x * width, width):
+                    near = distance[max(z - 1, 0) : z + 2, max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+                    near[:] = np.minimum(near, np.uint8(1))
+                    distance[z, y, x] = 0
+    return distance
 
 
 @numba.njit(inline="always")
-def _may_hold_something(
-    origins: Any, directions: Any, ray: Any, start: Any, end: Any, blocks: Any, side: Any, reach: Any, contraction: Any
-) -> Any:
-    """Return whether an interval of a ray may cross an occupied cell.
+def _place(along: Any, width: Any, blocks: Any) -> Any:
+    """Return the block of a coordinate along one axis, and the distance to its nearer end in blocks; it is clamped."""
+    scaled = min(max(along, np.float32(0)), np.float32(1)) / width
+    block = min(np.int64(scaled), blocks - 1)
+    inside = scaled - np.float32(block)
+    return block, min(inside, np.float32(1) - inside)
 
-    If both its ends are within a block's width of its midpoint, the midpoint's block and its neighbours contain all of
-    it: coordinates of the cube change by at most 1/2 per unit of distance, 1/4 where space is contracted.
+
+@numba.njit(inline="always")
+def _free_until(origins: Any, directions: Any, ray: Any, t: Any, blocks: Any, width: Any, contraction: Any) -> Any:
+    """Return a distance up to which a ray meets no occupied cell from distance t on.
+
+    The cube around a point that reaches to the nearest occupied block is empty. Coordinates of the unit cube change by
+    at most 1/2 per unit of distance; where space is contracted, by 1/4 within the unit ball, and outside by less, most
+    where the ray is nearest to the origin.
     """
-    if end - start > reach:
-        return True
-    t = (start + end) * np.float32(0.5)
-    x, y, z = cube(
+    half, quarter, one, two = np.float32(0.5), np.float32(0.25), np.float32(1), np.float32(2)
+    x, y, z = (
         origins[ray, 0] + directions[ray, 0] * t,
         origins[ray, 1] + directions[ray, 1] * t,
         origins[ray, 2] + directions[ray, 2] * t,
-        contraction,
     )
-    return blocks[_block(z, side), _block(y, side), _block(x, side)]
+    a, b, c = cube(x, y, z, contraction)
+    count = blocks.shape[0]
+    (i, u), (j, v), (k, w) = _place(a, width, count), _place(b, width, count), _place(c, width, count)
+    distance = blocks[k, j, i]
+    if distance == 0:
+        return t
+    free = (np.float32(distance) - one + max(min(u, v, w), np.float32(0))) * width
+    rate = half
+    if contraction != 0:
+        square, outwards = (
+            x * x + y * y + z * z,
+            x * directions[ray, 0] + y * directions[ray, 1] + z * directions[ray, 2],
+        )
+        least = square - outwards * outwards if outwards < np.float32(0) else square
+        norm = np.sqrt(max(least, one))
+        rate = (two - one / norm) / norm * quarter
+    return t + free / rate * _ROUNDED_DOWN
 
 
 @numba.njit(inline="always")
@@ -114,12 +131,6 @@ def new_round() -> Any:
     return lanes, look, samples
 
 
-@numba.njit(inline="always")
-def block_reach(side: Any, contraction: Any) -> Any:
-    """Return the length of the longest interval that `_may_hold_something` can rule out."""
-    return np.float32(_block_side(side) / side * (4.0 if contraction == 0 else 7.8))
-
-
 @numba.njit(nogil=True, error_model="numpy")
 def fill_round(
     origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
@@ -134,7 +145,7 @@ def fill_round(
         number of samples found, and the ray that the next empty lane takes.
     """
     intervals = edges.shape[0] - 2 - CHUNK
-    reach = block_reach(side, contraction)
+    width = np.float32(_block_width(side, blocks.shape[0]) / side)
     filled = 0
     for lane in range(LANES):
         taken = 0
@@ -146,9 +157,11 @@ def fill_round(
                 coming += 1
             ray, k = lane_ray[lane], lane_next[lane]
             while k < intervals and taken == 0:
-                start, end = cut(edges, jitter[ray], k), cut(edges, jitter[ray], k + CHUNK)
-                if not _may_hold_something(origins, directions, ray, start, end, blocks, side, reach, contraction):
+                first, start = k, cut(edges, jitter[ray], k)
+                free = _free_until(origins, directions, ray, start, blocks, width, contraction)
+                while k + CHUNK < intervals and cut(edges, jitter[ray], k + CHUNK) < free:
                     k += CHUNK
+                if k > first:
                     continue
                 look_ahead(origins, directions, edges, jitter, ray, k, side, contraction, places, cells)
                 past = min(CHUNK, intervals - k)
@@ -270,11 +283,16 @@ def _sort(
                 encoded[to, feature] = code[thread, i, feature]
 
 
+def _blocks(along: March) -> np.ndarray:
+    """Return the distances to occupied cells of a march, made of its cells if it has none."""
+    return nearby_blocks(along.occupied.numpy()) if along.distances is None else along.distances.numpy()
+
+
 def flat_arguments(rays: Rays, along: March, grid: HashGrid, layers: tuple[torch.Tensor, ...]) -> tuple[Any, ...]:
     """Return rays, occupied cells, table and layers as the arrays that `_follow` takes, up to `deepest`."""
     return (
         rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy(), padded(along.edges),
-        rays.jitter.numpy(), along.occupied.contiguous().view(-1).numpy(), occupied_blocks(along.occupied.numpy()),
+        rays.jitter.numpy(), along.occupied.contiguous().view(-1).numpy(), _blocks(along),
         along.occupied.shape[0], CONTRACTIONS.index(along.contraction),
         grid.table.detach().contiguous().view(-1).numpy(), grid.table.shape[1],
         np.array(grid.resolutions, dtype=np.int32), flat_weights(layers), along.max_optical_depth,

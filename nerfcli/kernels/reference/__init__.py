@@ -18,6 +18,7 @@ from nerfcli.kernels.reference.compositing import (
 from nerfcli.kernels.reference.depth import ray_termination
 from nerfcli.kernels.reference.encoding import corner_rows, hash_encode
 from nerfcli.kernels.reference.marching import (
+    distances_to_occupied,
     keep_largest,
     march,
     occupied_samples,
@@ -38,6 +39,7 @@ __all__ = [
     "denoise_total_variation",
     "density",
     "depth_loss",
+    "distances_to_occupied",
     "distortion",
     "geometry",
     "hash_encode",

@@ -1,6 +1,8 @@
 """Samples along rays: those in occupied cells, and those among them that light reaches. Letters as in `interface`."""
 
+import numpy as np
 import torch
+from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 
 from nerfcli.kernels.contraction import grid_coordinates, sample_widths
@@ -96,3 +98,27 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid, cell_depths: Tenso
     seen = reached & ~faint
     kept = torch.nn.functional.pad(seen.cumsum(0), (1, 0))[offsets]
     return Samples(starts[seen], ends[seen], thickness[seen], encoded[seen], coordinates[seen], kept)
+
+
+# Blocks per axis of `distances_to_occupied` at most: their distances then stay in a processor's cache.
+_MOST_BLOCKS = 128
+
+
+def distances_to_occupied(occupied: Tensor) -> Tensor:
+    """Return how far it is from each block of cells to the nearest that has an occupied cell.
+
+    Args:
+        occupied: (G, G, G) bool on the CPU; G is a power of two, or at most 128.
+
+    Returns:
+        (B, B, B) uint8, B = min(G, 128): the largest of the distances along the axes, in blocks; 0 for a block that has
+        an occupied cell itself, 255 for that distance and more.
+    """
+    side = len(occupied)
+    blocks = min(side, _MOST_BLOCKS)
+    cells = side // blocks
+    filled = occupied.view(blocks, cells, blocks, cells, blocks, cells).any(5).any(3).any(1)
+    if not filled.any():
+        return torch.full(filled.shape, 255, dtype=torch.uint8)
+    distance = distance_transform_cdt(~filled.numpy(), metric="chessboard")
+    return torch.from_numpy(distance.clip(0, 255).astype(np.uint8))
