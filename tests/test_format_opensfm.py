@@ -202,7 +202,7 @@ def test_malformed_files_are_refused_with_file_and_field(tmp_path, change, what)
         (b"[3]", "reconstruction 0: is 3"),
         (b"[" * 100_000, "not valid JSON"),
         (b"9" * 5000, "not valid JSON"),
-        (b"\xff\xfe", "not UTF-8"),
+        (b"\xfe", "not UTF-8"),
     ],
 )
 def test_what_is_no_list_of_reconstructions_is_refused(tmp_path, data, what):

@@ -344,6 +344,25 @@ def test_of_several_models_the_largest_is_read_and_the_others_are_counted(end, t
     )
 
 
+@pytest.mark.parametrize("order", ["utf-16-le", "utf-16-be"])
+@pytest.mark.parametrize("form", ["transforms", "colmap-text", "reality-capture", "pose-files"])
+def test_files_that_powershell_has_written(order, form, tmp_path):
+    """Its > writes UTF-16 with a byte order mark and CRLF."""
+    put(form, tmp_path)
+    before = parsed(tmp_path)
+    for path in (path for path in tmp_path.rglob("*") if path.suffix in (".txt", ".json", ".csv")):
+        path.write_bytes(("\ufeff" + path.read_text(encoding="utf-8").replace("\n", "\r\n")).encode(order))
+    after = parsed(tmp_path)
+    np.testing.assert_array_equal([f.world_from_cam for f in after.frames], [f.world_from_cam for f in before.frames])
+    np.testing.assert_array_equal(after.points, before.points)
+
+
+def test_a_name_that_no_file_can_have_is_a_missing_photo(tmp_path):
+    photos(tmp_path, numbered("{}.png")[1:])
+    transforms(tmp_path, ["x" * 300 + ".png", *numbered("{}.png")[1:]])
+    assert [frame.has_photo for frame in parsed(tmp_path).frames] == [False, *[True] * (COUNT - 1)]
+
+
 def test_a_lens_of_a_later_colmap_is_named_with_what_supports_it(tmp_path):
     put("colmap", tmp_path)
     path = tmp_path / "sparse/0/cameras.bin"

@@ -1,5 +1,6 @@
 """Frames: a camera, its pose and its picture; found by name."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -64,7 +65,8 @@ class Frame:
     @property
     def has_photo(self) -> bool:
         """True if its picture is on disk."""
-        return self.image is not None and self.image.is_file()
+        # Not Path.is_file, which raises where a name is too long for the file system.
+        return self.image is not None and os.path.isfile(self.image)
 
     @property
     def centre(self) -> np.ndarray:

@@ -19,6 +19,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import colmap_binary, colmap_text
 from nerfcli.captures.formats.colmap_model import ColmapImage, ColmapModel, capture_of, model_of
+from nerfcli.captures.formats.fields import opened
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.photo_names import with_photos
 from nerfcli.captures.formats.unsupported import lost_parts
@@ -220,7 +221,7 @@ def num_images(model_dir: Path) -> int:
     """Return the number of images that a model announces; 0 if its file is damaged."""
     path = _file(model_dir, "images")
     if path.suffix == ".txt":
-        with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        with opened(path) as stream:
             # The line after an image's line lists its features.
             return sum(1 for line in stream if line.strip() and line[0] != "#" and (next(stream, "") or True))
     with path.open("rb") as stream:

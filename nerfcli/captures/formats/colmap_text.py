@@ -9,6 +9,7 @@ import numpy as np
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.formats.colmap_model import ColmapImage, ColmapModel, ImageRow, images_of_rows, pose_rows, tracks
+from nerfcli.captures.formats.fields import decoded
 from nerfcli.captures.formats.limits import checked_camera, plausible
 
 # Ids have 32 bits, those of points 64, of which float64 holds 53 exactly.
@@ -109,7 +110,7 @@ def points_to_bytes(model: ColmapModel) -> bytes:
 
 def _lines(data: bytes) -> list[str]:
     # Not splitlines(), which also splits at characters that a file name may hold.
-    return [line.removesuffix("\r") for line in data.decode("utf-8-sig").split("\n")]
+    return decoded(data).split("\n")
 
 
 def _filled(lines: list[str]) -> list[str]:

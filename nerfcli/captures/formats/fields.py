@@ -3,12 +3,13 @@
 `where` is always the file and the place in it, such as "poses.txt: line 3"; it begins the message.
 """
 
+import codecs
 import json
 import math
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -33,14 +34,34 @@ def shown(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
+def decoded(data: bytes) -> str:
+    """Decode text in UTF-8, or in UTF-16 with its byte order mark, as PowerShell's > writes it; lines end in a newline.
+
+    Raises:
+        UnicodeDecodeError: it is neither.
+    """
+    return data.decode(_encoding(data)).replace("\r\n", "\n").replace("\r", "\n")
+
+
+def opened(path: Path) -> TextIO:
+    """Open a file to look at its beginning as text, decoded as by `decoded`; what is no text is replaced."""
+    with path.open("rb") as stream:
+        encoding = _encoding(stream.read(2))
+    return path.open(encoding=encoding, errors="replace")
+
+
+def _encoding(data: bytes) -> str:
+    return "utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+
+
 def read_text(path: Path, expected: str) -> str:
-    """Read the text of a file in UTF-8, with or without a byte order mark.
+    """Read the text of a file in UTF-8, with or without a byte order mark, or in UTF-16 with one.
 
     Raises:
         UserError: the file is missing, not readable, or not text; `expected` says what it should have been.
     """
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return decoded(path.read_bytes())
     except OSError as error:
         raise malformed(str(path), error.strerror or str(error), expected) from error
     except UnicodeDecodeError as error:

@@ -12,7 +12,7 @@ from typing import Any
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import read_json_object
+from nerfcli.captures.formats.fields import opened, read_json_object
 from nerfcli.errors import UserError
 
 
@@ -106,7 +106,7 @@ def only_file(folder: Path, pattern: str, begins: str) -> Path | None:
 
 
 def begins_with(path: Path, text: str) -> bool:
-    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+    with opened(path) as stream:
         return stream.read(len(text)) == text
 
 
@@ -116,7 +116,7 @@ def find_json(path: Path, *, opening: str, name: str) -> Path | None:
         return path / name if (path / name).is_file() else None
     if path.suffix.lower() != ".json":
         return None
-    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+    with opened(path) as stream:
         return path if stream.read(1000).lstrip().startswith(opening) else None
 
 

@@ -21,7 +21,15 @@ import numpy as np
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, size_of
+from nerfcli.captures.formats.fields import (
+    check_unique_names,
+    content_lines,
+    malformed,
+    numbers,
+    opened,
+    read_text,
+    size_of,
+)
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.lens_fits import Fits
 from nerfcli.captures.formats.limits import FramePoses, checked_camera
@@ -52,7 +60,7 @@ def pose_files(folder: Path) -> list[Path]:
 
 def is_pose(path: Path) -> bool:
     """Return whether a text file has as many numbers as a pose."""
-    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+    with opened(path) as stream:
         return len(stream.read(10_000).split()) in (12, 16)
 
 

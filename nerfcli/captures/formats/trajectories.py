@@ -16,7 +16,15 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text, shown
+from nerfcli.captures.formats.fields import (
+    check_unique_names,
+    content_lines,
+    malformed,
+    numbers,
+    opened,
+    read_text,
+    shown,
+)
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, with_photos
@@ -183,7 +191,7 @@ def find_lines(path: Path, *, columns: int) -> Path | None:
     """Find a text file whose first line that is neither empty nor a comment has `columns` words."""
     if not path.is_file() or path.suffix.lower() != ".txt":
         return None
-    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+    with opened(path) as stream:
         for _ in range(1000):
             line = stream.readline(10_000)
             if line.strip() and not line.lstrip().startswith("#"):
