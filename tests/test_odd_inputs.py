@@ -23,7 +23,7 @@ from views import PINHOLE, capture_of
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opengl_from_opencv_pose
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.colmap import write_colmap_text
+from nerfcli.captures.formats.colmap import write_colmap_binary, write_colmap_text
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.lens_fits import Fits, Terms
 from nerfcli.captures.formats.photo_names import find_photos
@@ -342,6 +342,57 @@ def test_of_several_models_the_largest_is_read_and_the_others_are_counted(end, t
         "sparse/1 with 4 photos is read; other models, which are in other coordinates: sparse/0 with 2, sparse/10 "
         "with 1",
     )
+
+
+@pytest.mark.parametrize("lost", ["points3D.txt", "points3D.bin"])
+def test_a_model_without_its_points_keeps_its_poses(lost, tmp_path):
+    photos(tmp_path / "images", numbered("{}.png"))
+    named = tuple(replace(frame, name=f"{i}.png") for i, frame in enumerate(CAPTURE.frames))
+    write = write_colmap_text if lost.endswith(".txt") else write_colmap_binary
+    write(replace(CAPTURE, frames=named), tmp_path / "sparse/0")
+    (tmp_path / "sparse/0" / lost).unlink()
+    capture = parsed(tmp_path)
+    np.testing.assert_allclose([f.centre for f in capture.frames], [f.centre for f in CAPTURE.frames], atol=1e-12)
+    assert len(capture.points) == 0
+    assert capture.notes == (f"{tmp_path / 'sparse/0' / lost} does not exist: no points are read",)
+
+
+@pytest.mark.parametrize("between", ["\n", "\n\n"])
+def test_lines_of_features_that_were_left_out_by_hand(between, tmp_path):
+    """COLMAP's documentation asks for an empty line there; names have spaces, as RealityScan writes them."""
+    names = numbered("A DJI ({}).png")
+    photos(tmp_path / "images", names)
+    colmap(tmp_path, names)
+    path = tmp_path / "sparse/0/images.txt"
+    listed = [line for line in path.read_text().splitlines() if line.endswith(".png")]
+    path.write_text("# by hand\n" + between.join(listed) + "\n")
+    capture = parsed(tmp_path)
+    assert [frame.name for frame in capture.frames] == names
+    np.testing.assert_allclose([f.centre for f in capture.frames], [f.centre for f in CAPTURE.frames], atol=1e-12)
+    assert len(capture.points) == len(CAPTURE.points)
+
+
+def test_names_in_a_code_page_of_windows_are_refused_with_what_to_do(tmp_path):
+    put("colmap", tmp_path)
+    path = tmp_path / "sparse/0/images.bin"
+    path.write_bytes(path.read_bytes().replace(b"2.jpg", "照2".encode("gbk") + b"jp"))
+    with pytest.raises(UserError, match=r"images\.bin: the name of a photo is not in UTF-8 \(byte 0xd5\)") as caught:
+        parsed(tmp_path)
+    assert "rename the photos to plain letters" in caught.value.hint
+
+
+@pytest.mark.parametrize("folder", ["dense", "dense/0"])
+def test_the_undistorted_copy_in_a_workspace_of_colmap_is_found(folder, tmp_path):
+    photos(tmp_path / "images", numbered("{}.png"), size=(SIZE[0] + 60, SIZE[1] + 45))
+    photos(tmp_path / folder / "images", numbered("{}.png"))
+    colmap(tmp_path / folder, numbered("{}.png"))
+    for path in (tmp_path / folder / "sparse/0").iterdir():
+        path.rename(path.parents[1] / path.name)
+    (tmp_path / folder / "sparse/0").rmdir()
+    capture = parsed(tmp_path)
+    images = [tmp_path / folder / "images" / name for name in numbered("{}.png")]
+    assert [frame.image for frame in capture.frames] == images
+    assert capture.notes == ()
 
 
 @pytest.mark.parametrize("order", ["utf-16-le", "utf-16-be"])

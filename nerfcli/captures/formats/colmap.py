@@ -14,6 +14,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+
 from nerfcli.atomic import atomic_folder
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.capture import Capture
@@ -35,8 +37,8 @@ T = TypeVar("T")
 
 
 def is_model(folder: Path) -> bool:
-    """Return whether a folder contains the three files of a COLMAP model, binary or text."""
-    return any(all((folder / f"{name}{suffix}").is_file() for name in FILES) for suffix in _ENCODINGS)
+    """Return whether a folder contains the cameras and images of a COLMAP model, binary or text; points may be lost."""
+    return any(all((folder / f"{name}{suffix}").is_file() for name in FILES[:2]) for suffix in _ENCODINGS)
 
 
 def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
@@ -46,7 +48,7 @@ def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
     hold the ids, the mean reprojection error of each point, or rigs.
 
     Args:
-        model_dir: holds cameras, images and points3D, as .bin (which wins) or .txt.
+        model_dir: holds cameras, images and points3D, as .bin (which wins) or .txt; points3D may be missing.
         image_dir: the folder that the names of the images are relative to; nothing is looked up there.
 
     Raises:
@@ -89,7 +91,11 @@ def read_model(model_dir: Path) -> ColmapModel:
     encoding = _ENCODINGS[cameras_file.suffix]
     cameras = _parse(cameras_file, encoding.cameras_from_bytes)
     images, notes = _parse(images_file, encoding.images_from_bytes)
-    point_ids, points, colours = _parse(points_file, encoding.points_from_bytes)
+    if points_file.exists():
+        point_ids, points, colours = _parse(points_file, encoding.points_from_bytes)
+    else:
+        point_ids, points, colours = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+        notes = (*notes, f"{points_file} does not exist: no points are read")
     if not images:
         raise UserError(f"{model_dir} has no registered images", "the reconstruction is empty; run it again")
     for image in images:
@@ -141,10 +147,16 @@ def _parse(path: Path, reader: Callable[[bytes], T]) -> T:
         data = path.read_bytes()
     except OSError as error:
         raise UserError(
-            f"{path}: {error.strerror or error}", "a COLMAP model needs cameras, images and points3D, as .bin or .txt"
+            f"{path}: {error.strerror or error}", "a COLMAP model needs cameras and images, as .bin or .txt"
         ) from error
     try:
         return reader(data)
+    except UnicodeDecodeError as error:
+        raise UserError(
+            f"{path}: the name of a photo is not in UTF-8 (byte 0x{error.object[error.start]:02x})",
+            "COLMAP for Windows writes such names of photos in its code page: rename the photos to plain letters and "
+            "digits, and reconstruct the model again",
+        ) from error
     except (struct.error, ValueError, IndexError, KeyError) as error:
         raise UserError(
             f"{path} is damaged: {error}", "the file is truncated or was changed; copy or reconstruct the model again"
@@ -206,7 +218,7 @@ def _write(capture: Capture, path: Path, suffix: str, *, wrong: list[str]) -> No
         (partial / f"points3D{suffix}").write_bytes(encoding.points_to_bytes(model))
 
 
-_FOLDERS = ("sparse", "colmap/sparse", ".", "distorted/sparse")
+_FOLDERS = ("sparse", "colmap/sparse", ".", "distorted/sparse", "dense/sparse", "dense/0/sparse")
 
 
 def find_model(path: Path) -> Path | None:

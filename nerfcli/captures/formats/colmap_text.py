@@ -31,15 +31,17 @@ def cameras_from_bytes(data: bytes) -> dict[int, Camera]:
 
 def images_from_bytes(data: bytes) -> tuple[list[ColmapImage], tuple[str, ...]]:
     """Return the images, in the file's order, and notes. Raises ValueError where a line is damaged."""
-    rows, lines = list[ImageRow](), iter(_lines(data))
-    for line in lines:
+    rows, lines = list[ImageRow](), _lines(data)[::-1]
+    while lines:
+        line = lines.pop()
         if not line.strip() or line.startswith("#"):
             continue
         image_id, *pose, camera_id, name = line.strip().split(maxsplit=9)
-        # The line after an image's line lists its features; it may be empty, or missing at the end of the file.
+        # The line after an image's line lists its features; it may be empty, and is missing in files written by hand.
         if len(pose) != 7:
             raise ValueError(f"the line of image {name} has {len(pose) + 3} words, expected 10")
-        values = np.fromiter(map(float, next(lines, "").split()), dtype=np.float64)
+        features = lines.pop() if lines and not _is_image(lines[-1]) else ""
+        values = np.fromiter(map(float, features.split()), dtype=np.float64)
         if len(values) % 3:
             raise ValueError(f"the features of image {name} are {len(values)} numbers, expected x, y, point id of each")
         values = values.reshape(-1, 3)
@@ -111,6 +113,17 @@ def points_to_bytes(model: ColmapModel) -> bytes:
 def _lines(data: bytes) -> list[str]:
     # Not splitlines(), which also splits at characters that a file name may hold.
     return decoded(data).split("\n")
+
+
+def _is_image(line: str) -> bool:
+    """Return whether a line of images.txt has as many words as that of an image, and ends with a name."""
+    try:
+        float(line.rsplit(maxsplit=1)[-1])
+    except ValueError:
+        return len(line.split(maxsplit=9)) == 10
+    except IndexError:  # an empty line
+        pass
+    return False
 
 
 def _filled(lines: list[str]) -> list[str]:
