@@ -5,6 +5,7 @@ says which photo was found.
 """
 
 import json
+import shutil
 import struct
 from collections.abc import Sequence
 from dataclasses import replace
@@ -523,3 +524,20 @@ def test_equal_labels_of_metashape_are_told_apart_by_their_groups(tmp_path):
     assert images["left/0"] == tmp_path / "images/left/0.jpg"
     assert images["right/0"] == tmp_path / "images/right/0.jpg"
     assert "1 of 8 cameras left out, without a label: id 2" in capture.notes
+
+
+def test_keyframes_of_polycam_whose_corrected_cameras_lack_their_size(tmp_path):
+    """Newer versions write width and height to cameras/ only."""
+    put("polycam", tmp_path)
+    home = tmp_path / "keyframes"
+    shutil.copytree(home / "corrected_cameras", home / "cameras")
+    for path in (home / "corrected_cameras").iterdir():
+        content = json.loads(path.read_text())
+        del content["width"], content["height"]
+        path.write_text(json.dumps(content))
+    capture = parsed(tmp_path)
+    assert_centres(capture, POSES[:, :3, 3])
+    assert {frame.camera.size for frame in capture.frames} == {CAMERA.size}
+    assert capture.notes == ()
+    (home / "corrected_cameras/1002.json").unlink()
+    assert parsed(tmp_path).notes == ("1 of 8 keyframes left out, whose poses Polycam has not corrected",)

@@ -2,8 +2,9 @@
 
 keyframes/corrected_cameras/ID.json belongs to keyframes/corrected_images/ID.jpg: t_00 to t_23 are the first three rows
 of world_from_cam with OpenGL axes, in metres, the world's y axis up; fx, fy, cx, cy are in pixels of a picture of width
-and height. Corrected photos are undistorted, and their poses are those after loop closure; captures too large for that
-have cameras/ and images/ only. depth/ID.png is the LiDAR's depth in millimetres, confidence/ID.png how sure it is.
+and height, which newer versions write to cameras/ID.json only. Corrected photos are undistorted, and their poses are
+those after loop closure; captures too large for that have cameras/ and images/ only. depth/ID.png is the LiDAR's depth
+in millimetres, confidence/ID.png how sure it is.
 Source: PolyCam/polyform README.md, "Polycam's data format", and polyform/convertors/instant_ngp.py.
 """
 
@@ -48,7 +49,8 @@ def parse_polycam(folder: Path, *, images: Path | None = None) -> Capture:
     for file in sorted(found[0].glob("*.json"), key=lambda file: (len(file.stem), file.stem)):
         where, record = str(file), read_json_object(file)
         fx, fy, cx, cy = (number(record, key, where) for key in ("fx", "fy", "cx", "cy"))
-        size = size_of(number(record, "width", where), number(record, "height", where), where)
+        sides = record if "width" in record else _uncorrected(file)
+        size = size_of(number(sides, "width", where), number(sides, "height", where), where)
         camera = checked_camera("PINHOLE", *size, (fx, fy, cx, cy), where=where)
         stems.append(file.stem)
         views.append((camera, poses.read(file.stem, where, partial(_matrix, record, where))))
@@ -59,7 +61,9 @@ def parse_polycam(folder: Path, *, images: Path | None = None) -> Capture:
         for stem, image, (camera, pose) in zip(stems, photos.paths, views, strict=True)
         if image is not None and pose is not None
     ]
-    notes = (*photos.notes, *poses.notes())
+    whole = len(list((folder / KEYFRAMES / "cameras").glob("*.json")))
+    left = (f"{whole - len(stems)} of {whole} keyframes left out, whose poses Polycam has not corrected",)
+    notes = (*photos.notes, *poses.notes(), *(left if whole > len(stems) else ()))
     check_unique_names((frame.name for frame in frames), folder)
     return Capture(
         tuple(frames),
@@ -70,6 +74,12 @@ def parse_polycam(folder: Path, *, images: Path | None = None) -> Capture:
         unit_source="LiDAR (Polycam)",
         notes=notes,
     )
+
+
+def _uncorrected(file: Path) -> dict[str, Any]:
+    """Return the camera of a keyframe before its correction, which has the same size; empty if there is none."""
+    path = file.parent.with_name("cameras") / file.name
+    return read_json_object(path) if path.is_file() else {}
 
 
 def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
