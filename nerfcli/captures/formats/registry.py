@@ -3,6 +3,7 @@
 All commands that read captures go through it.
 """
 
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -101,13 +102,24 @@ def recognise(path: Path) -> tuple[Format, Path]:
         return found
     if path.is_file() and path.suffix.lower() in ARCHIVES:
         raise UserError(f"{path} is an archive", f"unpack it with: nerfcli convert {in_shell(path)} SCENE --to nerfcli")
+    if inside := _captures_in(path):
+        more = f" and in {several(len(inside) - 1, 'other folder')}" if len(inside) > 1 else ""
+        raise UserError(f"{path} contains no capture", f"there is one in {in_shell(inside[0])}{more}: give that folder")
     if photos := photo_folder(path):
+        above = path.parent if path.name else path.resolve().parent
+        other = f"those of {in_shell(above)} are used if you give that folder, or " if recognised(above) else ""
         raise UserError(
             f"{photos} has {several(len(list_images(photos)), 'photo')} but no cameras",
-            f"estimate them with: nerfcli poses {in_shell(photos)}",
+            f"{other}estimate them with: nerfcli poses {in_shell(photos)}",
         )
     looked_for = ", ".join(dict.fromkeys(form.looked_for for form in FORMATS if form.looked_for))
     raise UserError(f"{path} contains no capture in a supported format", f"looked for {looked_for}")
+
+
+def _captures_in(path: Path) -> list[Path]:
+    """Return the folders in a folder which are captures."""
+    folders = [child for child in sorted(path.iterdir()) if child.is_dir()] if path.is_dir() else []
+    return [folder for folder in folders if os.access(folder, os.R_OK | os.X_OK) and recognised(folder) is not None]
 
 
 def refuse_archive(path: Path) -> None:
