@@ -26,8 +26,18 @@ from nerfcli import cli
 from nerfcli.atomic import write_json
 from nerfcli.captures.loading import fingerprint, load_scene
 from nerfcli.cli.options import seconds_from_text
-from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, TERMINATED, TOO_FEW_PHOTOS, in_shell
+from nerfcli.errors import (
+    BAD_INPUT,
+    GATE_NOT_MET,
+    INTERRUPTED,
+    OUT_OF_MEMORY,
+    TERMINATED,
+    TOO_FEW_PHOTOS,
+    UserError,
+    in_shell,
+)
 from nerfcli.interrupts import install_handlers
+from nerfcli.output import Output
 from nerfcli.photos.images import read_image
 from nerfcli.photos.masks import write_masks
 from nerfcli.poses import structure_from_motion
@@ -722,17 +732,32 @@ def test_photos_of_a_path_are_wrong_usage_for_other_views(finished):
     assert nerfcli("render", finished, "--through", "r_001.png").exit_code == 2
 
 
+def test_run_trains_a_capture_with_the_poses_that_it_has(monkeypatch, capture):
+    trained = []
+
+    def only_asked(scene: Path, output: Output, *given: object, **more: object) -> None:
+        trained.append((scene, output.path))
+        raise UserError("enough", "of this test")
+
+    monkeypatch.setattr("nerfcli.workflows.train.train_scene", only_asked)
+    result = nerfcli("run", capture)
+    assert error_of(result)[0] == "Error: enough"
+    assert trained == [(capture, capture.with_name("spheres-run"))]
+    assert f"{capture} has poses (" in result.stderr
+    assert result.stdout == ""
+
+
 @pytest.mark.usefixtures("coarse_steps")
 def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch, capture, tmp_path):
     # Structure from motion has its own tests; here it finds the poses that the capture has.
     def known_poses(folder: Path, target: Path, **more: object) -> SimpleNamespace:
         if not target.exists():
-            shutil.copytree(folder, target)
+            shutil.copytree(capture, target)
         return estimated_poses()
 
     monkeypatch.setattr(structure_from_motion, "estimate_poses", known_poses)
     monkeypatch.setattr(settings, "FEWEST_LOG2_ROWS", 10)
-    arguments = ["run", capture, "-o", tmp_path / "all", "--budget", "0.2s", "--downscale", "4"]
+    arguments = ["run", capture / "train", "-o", tmp_path / "all", "--budget", "0.2s", "--downscale", "4"]
 
     def interrupted(*args: Any, on_progress: Callable[[Progress], None], **more: Any) -> None:
         def stop_at_the_first_step(progress: Progress) -> None:

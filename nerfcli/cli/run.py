@@ -9,6 +9,7 @@ from nerfcli.cli import options
 from nerfcli.cli.batch import Given, for_each_input
 from nerfcli.cli.console import command
 from nerfcli.cli.poses import PhotoOptions
+from nerfcli.errors import in_shell
 
 if TYPE_CHECKING:
     from nerfcli.workflows.evaluate import Evaluation
@@ -18,7 +19,10 @@ if TYPE_CHECKING:
 def run(
     photos: Annotated[
         str,
-        typer.Argument(help="Folder of photos, zip archive of one, or video; or - to read paths from standard input."),
+        typer.Argument(
+            help="Folder of photos, zip archive of one, video, or capture with poses; or - to read paths from standard "
+            "input."
+        ),
     ],
     *,
     writing: options.Writing,
@@ -31,8 +35,9 @@ def run(
     """Run all stages: poses, train, evaluate, splats, video, report.
 
     Writes PHOTOS-scene/, PHOTOS-scene-run/ and PHOTOS-scene-run-splats.ply next to the photos, or scene/, run/ and
-    run-splats.ply inside --output. The video is made from the splats. Completed stages are kept: run the same command
-    again to resume an interrupted run. For other settings, run the stages one by one.
+    run-splats.ply inside --output. A capture with poses, such as a COLMAP project or a folder with transforms.json, is
+    trained with these. The video is made from the splats. Completed stages are kept: run the same command again to
+    resume an interrupted run. For other settings, run the stages one by one.
 
     \b
     Examples:
@@ -40,6 +45,7 @@ def run(
       nerfcli run photos/kitchen -o kitchen --budget 5m
       nerfcli run photos/kitchen --intrinsics calibration/cameras.txt
       nerfcli run kitchen.mp4
+      nerfcli run colmap-project
       nerfcli run photos/kitchen --require "psnr>=25,registered>=0.9"
     """
     from nerfcli.cli.evaluate import requirements_of, show_evaluation
@@ -74,6 +80,7 @@ def run(
             show=show,
         )
         console.note(f"report with all results: {done.report}")
+        console.note(f"next: open it in a browser, or look around: nerfcli view {in_shell(done.run.path)}")
         check_requirements(done.run, done.evaluation.metrics, requirements)
 
     for_each_input(photos, work, command="run")

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from nerfcli.captures.formats.registry import recognised
 from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
 from nerfcli.output import Output, beside
@@ -26,7 +27,7 @@ class PipelineResult:
     """What `run_pipeline` made.
 
     Args:
-        scene: the folder with poses.
+        scene: the folder with poses, or the capture that was given.
         run: the trained field.
         evaluation, evaluation_of_splats: metrics on the held-out photos.
         splats: a .ply.
@@ -63,7 +64,7 @@ def run_pipeline(
         >>> done.evaluation.metrics.mean.psnr, done.report
 
     Args:
-        photos: a folder of photos, or a video.
+        photos: a folder of photos, or a video; or a capture with poses, such as a COLMAP project, which are used.
         output: the folder for scene/, run/ and run-splats.ply; by default PHOTOS-scene, ... beside the photos.
         poses, training: settings of the stages; by default those of `nerfcli run`. Splats are refined for half of the
             budget of the training.
@@ -76,27 +77,30 @@ def run_pipeline(
     Raises:
         UserError: as the functions of the stages do. After a KeyboardInterrupt, the same call continues.
     """
-    scene_path = beside(without_suffix(Path(photos)), "-scene") if output.path is None else Path(output.path) / "scene"
-    run_path = beside(scene_path, "-run") if output.path is None else Path(output.path) / "run"
     device, again = resources.torch_device, output.overwrite
     usual_training = TrainSettings(budget_seconds=120.0, model="auto", **sizes_for(device))
     settings = replace(training or usual_training, threads=resources.cores, device=device)
 
-    scene = estimate_poses(
-        photos,
-        Output(scene_path, again),
-        replace(poses, threads=resources.cores),
-        frames=frames,
-        intrinsics=intrinsics,
-        resources=resources,
-        reporter=reporter,
-    )
+    scene, found = Path(photos), recognised(Path(photos))
+    if found is not None:
+        reporter.note(f"{scene} has poses ({found[0].of}), which are used; for new ones, give the folder of its photos")
+    else:
+        scene = estimate_poses(
+            photos,
+            Output(None if output.path is None else Path(output.path) / "scene", again),
+            replace(poses, threads=resources.cores),
+            frames=frames,
+            intrinsics=intrinsics,
+            resources=resources,
+            reporter=reporter,
+        )
+    run_path = beside(without_suffix(scene), "-run") if output.path is None else Path(output.path) / "run"
     with reporter.stage(f"train {scene.name}") as told:
         run = _trained(scene, Output(run_path, again), settings, resources, told)
     usual = Output(overwrite=again)
     with reporter.stage("evaluate") as told:
         evaluation = evaluate_run(run.path, usual, resources=resources, reporter=told)
-    for result in (scene, run.path, evaluation):
+    for result in (run.path, evaluation) if found else (scene, run.path, evaluation):
         show(result)
 
     splats = default_target(run.path, "splats")
