@@ -1,6 +1,7 @@
 """Splats of a run: refined, saved, resumed, interrupted, written, read, rendered and evaluated."""
 
 import os
+import re
 import shutil
 import signal
 from dataclasses import replace
@@ -16,7 +17,7 @@ from nerfcli import Output, Reporter
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, duration
 from nerfcli.field.exposure import exposed
 from nerfcli.kernels.numba_cpu.splats import render_splats
 from nerfcli.photos.images import read_image
@@ -160,7 +161,14 @@ def run(spheres_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_export_refines_once_and_writes_every_format(run: Path) -> None:
     """The .ply and .spz hold the same scene, whichever frame they are in; the second export uses the first's splats."""
     told: list[str] = []
-    ply = nerfcli.export_run(run, to="splats", splats=SMALL, reporter=Reporter(note=told.append))
+    shown: list[str] = []
+    reporter = Reporter(note=told.append, progress=lambda fraction, detail: shown.append(detail))
+    ply = nerfcli.export_run(run, to="splats", splats=SMALL, reporter=reporter)
+    # The budget counts down; what comes before it says nothing about its speed.
+    budget = duration(SMALL.budget_seconds)
+    assert f"depths of the training photos, {budget} of refinement left" in shown
+    assert f"pictures of the field, {budget} of refinement left" in shown
+    assert re.fullmatch(r"refines \d+ splats, 0 s left", shown[-1])
     assert ply == run.with_name("spheres-run-splats.ply")
     assert any("training photos: field" in line for line in told)
     state = (run / SPLATS).read_bytes()

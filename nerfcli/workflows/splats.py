@@ -10,7 +10,7 @@ import torch
 
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import Similarity, look_at
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, duration
 from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.interrupts import deferred_interrupts
@@ -148,10 +148,19 @@ def run_splats(run: Run, model: Model, *, settings: SplatSettings, reporter: Rep
         run.cameras.train, factor=run.config.downscale, threads=torch.get_num_threads(), masks=run.components.masks
     )
     splats = kept or _started(run, model, loaded, settings=settings, reporter=reporter)
-    pictures = pictures_beside(model, loaded, on_progress=reporter.part(_MAPS, _START, "pictures of the field"))
-    frame = {"splats_from_scene": model.training_from_scene, "near": near_of(splats.refinement.rows[:, :3])}
     began = splats.refinement.seconds / settings.budget_seconds
-    on_step = reporter.part(_START, 1.0, f"refines {len(splats.refinement.rows)} splats")
+    pictures = pictures_beside(
+        model, loaded, on_progress=reporter.part(_MAPS, _START, f"pictures of the field, {_before(settings)}")
+    )
+    frame = {"splats_from_scene": model.training_from_scene, "near": near_of(splats.refinement.rows[:, :3])}
+
+    def on_step(fraction: float) -> None:
+        left = duration(settings.budget_seconds * max(0.0, 1.0 - fraction))
+        reporter.progress(
+            _START + (1.0 - _START) * (fraction - began) / (1.0 - began),
+            f"refines {len(splats.refinement.rows)} splats, {left} left",
+        )
+
     with deferred_interrupts() as interrupts:
         refine(
             splats.refinement,
@@ -160,7 +169,7 @@ def run_splats(run: Run, model: Model, *, settings: SplatSettings, reporter: Rep
             beside=splat_photos(pictures, np.zeros((len(pictures), 3)), **frame),
             share=share_of_pictures(len(loaded)),
             seconds=settings.budget_seconds,
-            on_step=lambda fraction: on_step((fraction - began) / (1.0 - began)),
+            on_step=on_step,
             is_ended=lambda: interrupts.came is not None,
             notify=reporter.note,
         )
@@ -207,13 +216,18 @@ def _started(
         count=count,
         degree=settings.degree,
         with_gains=run.components.exposure != "none",
-        on_progress=reporter.part(0.0, _MAPS, "depths of the training photos"),
+        on_progress=reporter.part(0.0, _MAPS, f"depths of the training photos, {_before(settings)}"),
     )
     rows = rows_of(start.gaussians.moved(model.training_from_scene))
     assert model.sha256 is not None
     return RunSplats(
         Refinement.of(rows), start.log_gains, start.background, model.training_from_scene, model.sha256, count
     )
+
+
+def _before(settings: SplatSettings) -> str:
+    """Say what is left after what comes before the refinement, the speed of which says nothing about that."""
+    return f"{duration(settings.budget_seconds)} of refinement left"
 
 
 def compared_in_words(model: Model, loaded: Sequence[LoadedPhoto], splats: RunSplats) -> str:
