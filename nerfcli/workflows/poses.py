@@ -31,8 +31,8 @@ _STAGES = {
     "merge": "sub-models, merging them",
     "locate": "trials to locate single photos",
     "check": "checks of the poses",
-    "stabilise": "adjustments, trying a principal point for each photo",
-    "settle": "adjustments with a principal point for each photo",
+    "stabilise": "trials of principal points",
+    "settle": "adjustments of principal points",
 }
 
 
