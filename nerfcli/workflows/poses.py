@@ -19,10 +19,10 @@ from nerfcli.poses.workspace import is_same_scene
 
 _STAGES = {
     "read": "photos read",
-    "extract": "photos, extracting features",
-    "enlarge": "photos, extracting finer features",
-    "faint": "photos, extracting faint features",
-    "faint-enlarged": "photos, extracting faint features at double size",
+    "extract": "photos, features",
+    "enlarge": "photos, finer features",
+    "faint": "photos, faint features",
+    "faint-enlarged": "photos, faint finer features",
     "features": "features per photo",
     "pair": "photos, finding similar ones",
     "match": "pairs compared",
