@@ -347,7 +347,7 @@ def write_scannetpp(views: Views, folder: Path) -> Path:
         views.put(index, folder / f"dslr/resized_images/DSC{index:05d}.jpg")
         matrix = pose.copy()
         matrix[:3, :3] = pose[:3, :3] @ OPENGL
-        record = {"file_path": f"DSC{index:05d}.jpg", "mask_path": f"DSC{index:05d}.png", "is_bad": False}
+        record = {"file_path": f"DSC{index:05d}.jpg", "is_bad": False}
         frames.append(record | {"transform_matrix": matrix.tolist()})
     content = {"w": w, "h": h, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "camera_model": "PINHOLE"}
     content |= {"frames": frames[1:], "test_frames": frames[:1]}

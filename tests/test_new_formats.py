@@ -390,7 +390,7 @@ class TestEuroc:
         capture = parse(tmp_path)
         assert [frame.name.split("/")[0] for frame in capture.frames] == ["cam0", "cam0", "cam1", "cam1"]
         (note,) = capture.notes
-        assert re.fullmatch(r"2 photos left out, as no pose is near in time: cam0/data/999\d+.png, .*", note)
+        assert re.fullmatch(r"2 photos without a pose near in time left out: cam0/data/999\d+.png, .*", note)
 
     def test_a_model_that_is_not_supported_is_named(self, tmp_path):
         home = WITH_PHOTOS["euroc"](VIEWS, tmp_path).parent.parent
@@ -410,7 +410,7 @@ class TestTumRgbd:
         eighth = rigid.rotation_from_vector(np.array([0, 0, math.pi / 4]))
         (frame,) = capture.frames
         np.testing.assert_allclose(frame.world_from_cam, rigid.from_parts(eighth, PLACES[0]), rtol=0, atol=1e-9)
-        assert capture.notes == ("1 photo left out, as no pose is near in time: rgb/1.png",)
+        assert capture.notes == ("1 photo without a pose near in time left out: rgb/1.png",)
 
     @pytest.mark.parametrize(("sequence", "focal", "lens"), [("1", 517.3, "FULL_OPENCV"), ("3", 535.4, "PINHOLE")])
     def test_the_cameras_of_the_benchmark(self, tmp_path, sequence, focal, lens):
@@ -461,13 +461,16 @@ class TestScanNetPp:
         VIEWS.put(0, tmp_path / "dslr/resized_anon_masks/DSC00000.png")
         content = json.loads(path.read_text())
         content["frames"].append(content["frames"][0] | {"file_path": "DSC00009.jpg", "is_bad": True})
+        for record in (*content["frames"], *content["test_frames"]):
+            record["mask_path"] = record["file_path"].replace(".jpg", ".png")
         path.write_text(json.dumps(content))
         capture = parse(tmp_path / "dslr")
         assert {frame.name: (frame.split, frame.mask is not None) for frame in capture.frames} == {
             "DSC00001.jpg": ("train", False),
             "DSC00000.jpg": ("test", True),
         }
-        assert capture.notes == ("1 photo marked as bad left out",)
+        lost = "1 mask left out, which transforms.json names and do not exist: DSC00001.png"
+        assert capture.notes == (lost, "1 photo marked as bad left out")
 
     def test_undistorted_photos_have_their_own_file(self, tmp_path):
         path = WITH_PHOTOS["scannetpp"](VIEWS, tmp_path)

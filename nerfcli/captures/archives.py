@@ -87,8 +87,9 @@ def _checked(path: Path, entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo
     hint = "unpack it yourself if you trust its source, and give the folder"
     members: dict[str, zipfile.ZipInfo] = {}
     for entry in entries:
+        entry.filename = entry.filename.replace("\\", "/")  # as some programs on Windows write it
         parts = PurePosixPath(entry.filename).parts
-        wrong = not parts or "\\" in entry.filename or ":" in entry.filename or entry.filename.startswith("/")
+        wrong = not parts or ":" in entry.filename or entry.filename.startswith("/")
         if wrong or ".." in parts or not entry.filename.isprintable():
             raise UserError(f"{path} is not safe to unpack: it has a file named {entry.filename!r:.80}", hint)
         kind = stat.S_IFMT(entry.external_attr >> 16)
@@ -106,6 +107,9 @@ def _checked(path: Path, entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo
         raise UserError(f"{path} is not safe to unpack: it says that it has {what}", hint)
     if not members:
         raise UserError(f"{path} contains no files", "copy or download it again")
+    if all(PurePosixPath(name).suffix in ARCHIVES for name in members):
+        inner = next(iter(members.values())).filename
+        raise UserError(f"{path} contains only archives, such as {inner}", "unpack it, and give the archive in it")
     return list(members.values())
 
 

@@ -86,8 +86,8 @@ def list_images(folder: Path) -> list[Path]:
     try:
         files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise UserError(f"cannot list the photos in {folder}: {reason}", "give a folder of photos") from error
+        what = f"cannot list the photos in {folder}: {error.strerror or error}"
+        raise UserError(what, "give a folder of photos") from error
     pictures = [path for path in files if not path.name.startswith(".") and path.is_file()]
     usual = {path.stem for path in pictures if path.suffix.lower() in _USUAL_SUFFIXES}
     kept = (path for path in pictures if path.suffix.lower() in _USUAL_SUFFIXES or path.stem not in usual)
@@ -235,6 +235,8 @@ def opened(path: Path) -> Iterator[Image.Image]:
             raise UserError(f"{path} is a link to a file that does not exist", "copy the photo again") from error
         raise UserError(f"cannot read {path}: {error.strerror}", f"expected a {_FORMATS} file") from error
     except _DAMAGED as error:
+        if _has_float_samples(path):
+            raise UserError(f"{path} {_FLOAT}", _OR_REMOVE) from error
         raise UserError(f"{path} is damaged or truncated: {error}", _DAMAGED_HINT) from error
 
 
@@ -253,15 +255,19 @@ def _largest_page(image: Image.Image) -> int:
 
 
 def _has_float_samples(path: Path) -> bool:
-    """Return whether a file is a TIFF with float pixels, which Pillow opens only if they are grey."""
+    """Return whether a file is a TIFF with a page of float pixels, which Pillow opens only if they are grey."""
     try:
         with warnings.catch_warnings(action="ignore"), path.open("rb") as file:
-            tags = TiffImagePlugin.ImageFileDirectory_v2(file.read(8))
-            file.seek(tags.next)
-            tags.load(file)
-            return _FLOAT_SAMPLES in tags.get(_SAMPLE_FORMAT, ())
+            tags, pages = TiffImagePlugin.ImageFileDirectory_v2(file.read(8)), set[int]()
+            while tags.next and tags.next not in pages:
+                pages.add(tags.next)
+                file.seek(tags.next)
+                tags.load(file)
+                if _FLOAT_SAMPLES in tags.get(_SAMPLE_FORMAT, ()):
+                    return True
     except _DAMAGED:
-        return False
+        pass
+    return False
 
 
 def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
@@ -275,8 +281,7 @@ def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
     if image.mode in ("I", "F"):
         kind = "integer" if image.mode == "I" else "float"
         raise UserError(
-            f"{path} has 32-bit {kind} pixels, whose white level is unknown",
-            "save it with 8 or 16 bits per channel",
+            f"{path} has 32-bit {kind} pixels, whose white level is unknown", "save it with 8 or 16 bits per channel"
         )
     if mode == "RGBA" or image.mode not in ("RGB", "L", "CMYK"):
         image = image.convert(mode)
@@ -374,8 +379,7 @@ def where_photos_may_be(folder: Path) -> str:
     if with_photos:
         more = f" and {len(with_photos) - 1} more folders" if len(with_photos) > 2 else f" and {with_photos[1]}"
         return f"there are photos in {with_photos[0]}{more}; give one of them, or use all with --subfolders"
-    skipped = skipped_files(folder)
-    there = f"there are only {skipped}; " if skipped else ""
+    there = f"there are only {skipped}; " if (skipped := skipped_files(folder)) else ""
     return f"{there}expected files ending in {', '.join(sorted(IMAGE_SUFFIXES))}"
 
 
@@ -383,13 +387,9 @@ def _folders(folder: Path, *, subfolders: bool) -> list[Path]:
     """Return a folder and, on request, all of its subfolders; not hidden ones, nor links to the others."""
     if not subfolders:
         return [folder]
-    below = [path for path in folder.rglob("*") if path.is_dir()]
-    shown = [path for path in below if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
-    folders = [
-        folder,
-        *(path for path in shown if not path.is_symlink()),
-        *(path for path in shown if path.is_symlink()),
-    ]
+    below = (path for path in folder.rglob("*") if path.is_dir())
+    shown = [path for path in below if "/." not in f"/{name_in(folder, path)}"]
+    folders = [folder, *sorted(shown, key=Path.is_symlink)]
     return list({path.resolve(): path for path in reversed(folders)}.values())
 
 

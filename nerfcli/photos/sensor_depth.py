@@ -31,6 +31,8 @@ SAME_SHAPE = 0.03
 
 _HINT = "restore the file, or train with --no-sensor-depth"
 _UNKNOWN_LEVEL = 65535
+# By EXIF orientation, the steps along columns and rows after the axes were swapped.
+_MIRRORED = {5: (1, 1), 6: (-1, 1), 7: (-1, -1), 8: (1, -1)}
 
 
 @dataclass(frozen=True)
@@ -62,8 +64,9 @@ def read_sensor_depth(depth: SensorDepth, photo: Path) -> DepthReadings:
     confidence = np.ones_like(z) if depth.confidence is None else _confidence(depth.confidence, z.shape)
     z = np.where(confidence > 0, _without_edges(z), np.nan)
     if exif.orientation >= 5 and _is_shaped(z, stored) and not _is_shaped(z, stored[::-1]):
-        turn = {6: cv2.ROTATE_90_CLOCKWISE, 8: cv2.ROTATE_90_COUNTERCLOCKWISE}[exif.orientation]
-        z, confidence = cv2.rotate(z, turn), cv2.rotate(confidence, turn)
+        # As in `photos.images.upright`: mirrored at a diagonal, and then, but for 5, at one axis or both.
+        across, down = _MIRRORED[exif.orientation]
+        z, confidence = (np.ascontiguousarray(values.T[::down, ::across]) for values in (z, confidence))
     if not _is_shaped(z, (exif.width, exif.height)):
         shape = f"{z.shape[1]}x{z.shape[0]}, of another shape than its photo with {exif.width}x{exif.height}"
         raise UserError(f"{depth.path} is {shape}", _HINT)

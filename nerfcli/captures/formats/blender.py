@@ -18,12 +18,12 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opengl_from_opencv_pose
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import read_json_object
+from nerfcli.captures.formats.fields import check_unique_names, read_json_object
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.transforms import (
     SPLITS,
-    check_unique_names,
     listed_frames,
+    records_of,
     relative_path,
 )
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
@@ -52,13 +52,16 @@ def parse_blender(
         if path.exists():
             size = camera.size if camera else frames[0].camera.size if frames else None
             content = read_json_object(path)
-            listed, unknown, said = listed_frames(path, content, measure, suffix=".png", images=images, size=size)
+            records = records_of(path, content)
+            listed, unknown, said = listed_frames(
+                path, content, records, measure, suffix=".png", images=images, size=size
+            )
             frames += [replace(frame, split=split) for frame in listed]
             missing += unknown
             notes += said
     if not frames:
         raise UserError(f"{_file(folder, 'train')}: No such file", "give a folder of transforms_{train,val,test}.json")
-    check_unique_names(folder, frames)
+    check_unique_names((frame.name for frame in frames), folder)
     return Capture(tuple(frames), np.zeros((0, 3)), tuple(missing), None, "blender", notes=tuple(notes))
 
 

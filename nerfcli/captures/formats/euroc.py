@@ -9,6 +9,7 @@ Source: Burri et al. 2016, The EuRoC micro aerial vehicle datasets, section 5; e
 
 import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,19 +20,19 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import (
     check_unique_names,
-    content_lines,
     malformed,
     name_of,
     numbers,
+    read_rows,
     read_text,
     shown,
     size_of,
 )
 from nerfcli.captures.formats.format import Format
-from nerfcli.captures.formats.limits import quaternion_pose, rigid_pose
-from nerfcli.captures.formats.photo_names import find_photos
-from nerfcli.captures.formats.timed_poses import poses_at
-from nerfcli.errors import listed, several
+from nerfcli.captures.formats.limits import FramePoses, rigid_pose
+from nerfcli.captures.formats.photo_names import with_photos
+from nerfcli.captures.formats.timed_poses import photos_at
+from nerfcli.errors import several
 
 HOME, TRUTH = "mav0", "state_groundtruth_estimate0"
 _TRUTHS = (TRUTH, "mocap0")  # the latter of TUM VI, in the same layout
@@ -51,56 +52,49 @@ def parse_euroc(home: Path, *, images: Path | None = None) -> Capture:
         UserError: a file is damaged (file and line are named), or no photo has a pose.
     """
     truth = next(path for name in _TRUTHS if (path := home / name / "data.csv").is_file())
-    times, bodies = _bodies(truth)
-    names, seconds, views, cameras = [], [], [], {}
+    times, bodies, lost = _bodies(truth)
+    names, seconds, views = [], [], []
     for folder in sorted(path.parent for path in home.glob("cam*/data.csv")):
-        cameras[folder.name] = _sensor(folder / "sensor.yaml")
+        view = _sensor(folder / "sensor.yaml")
         for time, file in _pictures(folder / "data.csv"):
             names.append(f"{folder.name}/data/{file}")
             seconds.append((time - times[0]) / 1e9)
-            views.append(folder.name)
-    body_seconds = np.array([(time - times[0]) / 1e9 for time in times])
-    world_from_body, is_known = poses_at(body_seconds, bodies, np.array(seconds))
-    kept, unposed = np.flatnonzero(is_known), [names[index] for index in np.flatnonzero(~is_known)]
-    if not len(kept):
-        raise malformed(str(truth), "has no pose at the time of a photo", "copy the whole sequence")
-    names = [names[index] for index in kept]
-    check_unique_names(names, home)
-    sizes = [cameras[views[index]][0].size for index in kept]
-    found = find_photos(names, [home], given=images, sizes=sizes)
-    frames = []
-    for index, name, image in zip(kept, found.names, found.paths, strict=True):
-        camera, body_from_cam = cameras[views[index]]
-        place = image or (images or home) / name
-        frames.append(Frame(name, camera, world_from_body[index] @ body_from_cam, image=place))
-    notes = found.notes
-    if unposed:
-        notes += (f"{several(len(unposed), 'photo')} left out, as no pose is near in time: {listed(unposed)}",)
+            views.append(view)
+    body_seconds = [(time - times[0]) / 1e9 for time in times]
+    kept, poses, unposed = photos_at(names, seconds, body_seconds, bodies, where=str(truth))
+    check_unique_names([names[index] for index in kept], home)
+    frames = tuple(
+        Frame(names[index], views[index][0], pose @ views[index][1]) for index, pose in zip(kept, poses, strict=True)
+    )
     source = f"motion capture ({truth.parent.name})"
-    points = np.zeros((0, 3))
-    return Capture(tuple(frames), points, kind="euroc", unit="metre", unit_source=source, notes=notes)
+    notes = (*lost, *unposed)
+    capture = Capture(frames, np.zeros((0, 3)), kind="euroc", unit="metre", unit_source=source, notes=notes)
+    return with_photos(capture, home, given=images)
 
 
-def _bodies(path: Path) -> tuple[list[int], np.ndarray]:
-    """Return the times in nanoseconds and the poses world_from_body (N, 4, 4)."""
-    times, poses = [], []
-    for line_number, line in content_lines(read_text(path, _EXPECTED)):
-        where, words = f"{path}: line {line_number}", line.split(",")
-        x, y, z, qw, *vector = numbers(words[1:8], 7, where)
-        times.append(_nanoseconds(words[0], where))
-        poses.append(quaternion_pose(np.array([*vector, qw]), np.array([x, y, z]), where))
+def _bodies(path: Path) -> tuple[list[int], np.ndarray, tuple[str, ...]]:
+    """Return the times in nanoseconds and the poses world_from_body (N, 4, 4), and a note on what was left out."""
+    times, poses, usable = [], [], FramePoses()
+    for cells, where in read_rows(path, _EXPECTED, separator=","):
+        pose = usable.read_quaternion(cells[0], where, partial(_parts, cells, where))
+        if pose is not None:
+            times.append(_nanoseconds(cells[0], where))
+            poses.append(pose)
+    notes = usable.notes()
     if not times:
         raise malformed(str(path), "has no pose", _EXPECTED)
-    return times, np.stack(poses)
+    return times, np.stack(poses), notes
+
+
+def _parts(cells: list[str], where: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the quaternion xyzw and the position of a pose."""
+    x, y, z, qw, *vector = numbers(cells[1:8], 7, where)
+    return np.array([*vector, qw]), np.array([x, y, z])
 
 
 def _pictures(path: Path) -> list[tuple[int, str]]:
-    rows = []
-    for line_number, line in content_lines(read_text(path, _EXPECTED)):
-        time, _, file = line.partition(",")
-        where = f"{path}: line {line_number}"
-        rows.append((_nanoseconds(time, where), name_of(file, where)))
-    return rows
+    rows = read_rows(path, _EXPECTED, separator=",")
+    return [(_nanoseconds(cells[0], where), name_of(",".join(cells[1:]), where)) for cells, where in rows]
 
 
 def _nanoseconds(word: str, where: str) -> int:

@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, TextIO
+from typing import Any, NamedTuple, NoReturn, TextIO
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -128,6 +128,23 @@ def content_lines(text: str) -> list[tuple[int, str]]:
     return [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
 
 
+class Row(NamedTuple):
+    """The cells of a line of a table, and the line's place, to begin a message."""
+
+    cells: list[str]
+    where: str
+
+
+def read_rows(path: Path, expected: str, *, separator: str | None = None) -> list[Row]:
+    """Read a table: the lines that are neither empty nor comments, split at the separator, by default at spaces.
+
+    Raises:
+        UserError: see `read_text`.
+    """
+    lines = content_lines(read_text(path, expected))
+    return [Row([cell.strip() for cell in line.split(separator)], f"{path}: line {n}") for n, line in lines]
+
+
 def numbers(words: Sequence[str], count: int, where: str) -> list[float]:
     """Return the numbers of a line of text.
 
@@ -166,9 +183,7 @@ def number(record: dict[str, Any], key: str, where: str, *, default: float | Non
     """
     value = _number_of(record.get(key, default))
     if value is None:
-        kind = NotFiniteError if _is_not_finite(record.get(key, "")) else UserError
-        what = f"{key} is {shown(record.get(key))}" if key in record else f"{key} is missing"
-        raise kind(f"{where}: {what}", "expected a number")
+        raise _no_value(record, key, where, "expected a number")
     return value
 
 
@@ -181,11 +196,23 @@ def vector(record: dict[str, Any], key: str, count: int, where: str) -> np.ndarr
     value = record.get(key)
     values = [_number_of(item) for item in value] if isinstance(value, list) else []
     if len(values) != count or None in values:
-        what = f"{key} is missing" if key not in record else f"{key} is {shown(value)}"
-        lost = value is None or (isinstance(value, list) and any(map(_is_not_finite, value)))
-        kind = NotFiniteError if lost and key in record else UserError
-        raise kind(f"{where}: {what}", f"expected a list of {count} numbers")
+        hint = f"expected a list of {count} numbers"
+        if isinstance(value, list) and any(map(_is_not_finite, value)):
+            raise NotFiniteError(f"{where}: {key} contains a number that is not finite", hint)
+        raise _no_value(record, key, where, hint)
     return np.array(values, dtype=np.float64)
+
+
+def matrix(record: dict[str, Any], key: str, rows: tuple[int, ...], columns: int, where: str) -> np.ndarray:
+    """Return a matrix of a JSON object, as float64: a list of rows, whose number is one of `rows`.
+
+    Raises:
+        UserError: the key is absent, or its value is not such a list; a `NotFiniteError` if a number is not known.
+    """
+    value = record.get(key)
+    if isinstance(value, list) and len(value) in rows:
+        return np.stack([vector({key: row}, key, columns, where) for row in value])
+    raise _no_value(record, key, where, f"expected {rows[-1]} rows of {columns} numbers")
 
 
 def size_of(width: float, height: float, where: str) -> tuple[int, int]:
@@ -224,6 +251,13 @@ def check_unique_names(names: Iterable[str], path: Path) -> None:
         seen.add(name)
     if not seen:
         raise malformed(str(path), "lists no images with a pose", "the reconstruction is empty; run it again")
+
+
+def _no_value(record: dict[str, Any], key: str, where: str, hint: str) -> UserError:
+    """Return the error for a key that is absent or has another value than `hint` says."""
+    kind = NotFiniteError if _is_not_finite(record.get(key, "")) else UserError
+    what = f"{key} is {shown(record[key])}" if key in record else f"{key} is missing"
+    return kind(f"{where}: {what}", hint)
 
 
 def _number_of(value: Any) -> float | None:

@@ -8,7 +8,6 @@ reconstruction/points3d.txt: x, y, z, and red, green, blue.
 Source: naver/kapture kapture_format.adoc; kapture/core/Trajectories.py and PoseTransform.py.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +17,19 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import (
+    Row,
     check_unique_names,
-    content_lines,
     malformed,
     name_of,
     numbers,
-    read_text,
+    read_rows,
     shown,
     size_of,
 )
 from nerfcli.captures.formats.format import Format
-from nerfcli.captures.formats.limits import checked_camera
-from nerfcli.captures.formats.photo_names import GIVE_CAMERA, find_photos
-from nerfcli.errors import UserError, listed, several
+from nerfcli.captures.formats.limits import NotFiniteError, checked_camera, left_out, without
+from nerfcli.captures.formats.photo_names import GIVE_CAMERA, with_photos
+from nerfcli.errors import UserError, several
 
 SENSORS = "sensors"
 _FILES = ("sensors.txt", "records_camera.txt", "trajectories.txt")
@@ -38,12 +37,6 @@ _EXPECTED = "expected a file of kapture"
 _UNKNOWN = "UNKNOWN_CAMERA"
 # Rigs in rigs; more is a circle.
 _MOST_LEVELS = 8
-
-
-@dataclass(frozen=True)
-class _Row:
-    cells: list[str]
-    where: str
 
 
 def parse_kapture(folder: Path, *, camera: Camera | None = None, images: Path | None = None) -> Capture:
@@ -60,15 +53,19 @@ def parse_kapture(folder: Path, *, camera: Camera | None = None, images: Path | 
     home = folder / SENSORS
     cameras = {row.cells[0]: row for row in _rows(home / "sensors.txt", least=3) if row.cells[2] == "camera"}
     poses = {(row.cells[0], row.cells[1]): row for row in _rows(home / "trajectories.txt", least=9)}
-    rigs: dict[str, list[_Row]] = {}
+    rigs: dict[str, list[Row]] = {}
     for row in _rows(home / "rigs.txt", least=9) if (home / "rigs.txt").is_file() else []:
         rigs.setdefault(row.cells[1], []).append(row)
     known: dict[str, Camera] = {}
-    names, views, unposed = [], [], []
+    frames, unposed, lost = [], [], list[tuple[str, UserError]]()
     for row in _rows(home / "records_camera.txt", least=3):
         time, sensor = row.cells[:2]
         name = name_of(row.cells[2], row.where)
-        device_from_world = _pose_at(time, sensor, poses, rigs)
+        try:
+            device_from_world = _pose_at(time, sensor, poses, rigs)
+        except NotFiniteError as error:
+            lost.append((name, error))
+            continue
         if device_from_world is None:
             unposed.append(name)
             continue
@@ -76,35 +73,26 @@ def parse_kapture(folder: Path, *, camera: Camera | None = None, images: Path | 
             raise malformed(row.where, f"its sensor is {shown(sensor)}", "expected a camera of sensors.txt")
         if sensor not in known:
             known[sensor] = _camera(cameras[sensor], camera)
-        names.append(name)
-        views.append((known[sensor], rigid.inverse(device_from_world)))
-    check_unique_names(names, folder)
-    found = find_photos(names, [home], given=images, folders=("records_data",), sizes=[view.size for view, _ in views])
-    frames = tuple(
-        Frame(name, view, pose, image=image or (images or home / "records_data") / name)
-        for (view, pose), name, image in zip(views, found.names, found.paths, strict=True)
-    )
-    notes = found.notes
-    if unposed:
-        notes += (f"{several(len(unposed), 'photo')} without a pose left out: {listed(unposed)}",)
+        frames.append(Frame(name, known[sensor], rigid.inverse(device_from_world)))
+    check_unique_names((frame.name for frame in frames), folder)
     points, colours = _points(folder / "reconstruction/points3d.txt")
-    return Capture(frames, points, kind="kapture", colours=colours, notes=notes)
+    notes = (*left_out(lost, len(frames) + len(lost)), *without(unposed, "a pose"))
+    capture = Capture(tuple(frames), points, kind="kapture", colours=colours, notes=notes)
+    return with_photos(capture, home, given=images, folders=("records_data",))
 
 
-def _rows(path: Path, *, least: int) -> list[_Row]:
+def _rows(path: Path, *, least: int) -> list[Row]:
     """Return the lines of a table as cells without the spaces around them."""
-    rows = []
-    for line_number, line in content_lines(read_text(path, _EXPECTED)):
-        cells = [cell.strip() for cell in line.split(",")]
-        where = f"{path}: line {line_number}"
-        if len(cells) < least:
-            raise malformed(where, f"has {several(len(cells), 'value')}", f"expected {least} or more, with commas")
-        rows.append(_Row(cells, where))
+    rows = read_rows(path, _EXPECTED, separator=",")
+    for row in rows:
+        if len(row.cells) < least:
+            found = several(len(row.cells), "value")
+            raise malformed(row.where, f"has {found}", f"expected {least} or more, with commas")
     return rows
 
 
 def _pose_at(
-    time: str, device: str, poses: dict[tuple[str, str], _Row], rigs: dict[str, list[_Row]], level: int = 0
+    time: str, device: str, poses: dict[tuple[str, str], Row], rigs: dict[str, list[Row]], level: int = 0
 ) -> np.ndarray | None:
     """Return device_from_world at a time: the device's own pose, or that of a rig that it is in; None without one."""
     row = poses.get((time, device))
@@ -117,18 +105,18 @@ def _pose_at(
     return None
 
 
-def _transform(row: _Row) -> np.ndarray | None:
+def _transform(row: Row) -> np.ndarray | None:
     """Return the transform (4, 4) of a row's last seven cells; None if a part of it is not known."""
     cells = row.cells[2:9]
     if not all(cells):
         return None
     values = np.array(numbers(cells, 7, row.where))
     if not values[:4].any():
-        raise malformed(row.where, "its quaternion has length 0", "expected qw, qx, qy, qz")
+        raise NotFiniteError(f"{row.where}: its quaternion has length 0", "expected qw, qx, qy, qz")
     return rigid.from_parts(rigid.rotation_from_quaternion(values[:4]), values[4:])
 
 
-def _camera(row: _Row, given: Camera | None) -> Camera:
+def _camera(row: Row, given: Camera | None) -> Camera:
     if len(row.cells) < 6:
         raise malformed(row.where, "has no camera model with width and height", "expected MODEL, width, height, ...")
     model, *words = row.cells[3:]

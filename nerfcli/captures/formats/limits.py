@@ -214,6 +214,11 @@ def left_out(lost: Sequence[tuple[str, UserError]], count: int) -> tuple[str, ..
     return (f"{len(lost)} of {several(count, 'frame')} left out: {names} ({error.message})",)
 
 
+def without(names: Sequence[str], what: str) -> tuple[str, ...]:
+    """Return a line on the photos that are left out, as they are without a pose or the like; none if there are none."""
+    return (f"{several(len(names), 'photo')} without {what} left out: {listed(names)}",) if names else ()
+
+
 def quaternion_pose(xyzw: np.ndarray, position: np.ndarray, where: str) -> np.ndarray:
     """Return the pose (4, 4) of a quaternion (4,) in the order x, y, z, w and a position (3,).
 

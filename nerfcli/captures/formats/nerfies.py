@@ -22,6 +22,7 @@ from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import (
     check_unique_names,
     malformed,
+    matrix,
     number,
     read_json_object,
     shown,
@@ -29,10 +30,9 @@ from nerfcli.captures.formats.fields import (
     vector,
 )
 from nerfcli.captures.formats.format import Format, has_keys
-from nerfcli.captures.formats.limits import FramePoses, plausible
+from nerfcli.captures.formats.limits import FramePoses, plausible, without
 from nerfcli.captures.formats.npy import DAMAGED, array_of_npy
 from nerfcli.captures.formats.photo_names import find_photos
-from nerfcli.errors import listed, several
 
 CAMERAS, DATASET = "camera", "dataset.json"
 
@@ -54,28 +54,25 @@ def parse_nerfies(folder: Path, *, images: Path | None = None) -> Capture:
     names = _names(content, "ids", path) or [*train, *held_out]
     names = names or sorted(file.stem for file in (folder / CAMERAS).glob("*.json"))
     check_unique_names(names, path)
-    files = [folder / CAMERAS / f"{name}.json" for name in names]
-    unposed = [name for name, file in zip(names, files, strict=True) if not file.is_file()]
-    names = [name for name in names if name not in set(unposed)]
-    records = [(read_json_object(folder / CAMERAS / f"{name}.json"), name) for name in names]
-    views = [(_camera(record, str(folder / CAMERAS / f"{name}.json")), record) for record, name in records]
+    files = {name: folder / CAMERAS / f"{name}.json" for name in names}
+    unposed = [name for name, file in files.items() if not file.is_file()]
+    names = [name for name, file in files.items() if file.is_file()]
+    records = [read_json_object(files[name]) for name in names]
+    cameras = [_camera(record, str(files[name])) for name, record in zip(names, records, strict=True)]
     there = [name for name in _IMAGE_FOLDERS if (folder / name).is_dir()]
     homes = [folder / there[0]] if there else [folder]
-    found = find_photos(names, homes, given=images, sizes=[camera.size for camera, _ in views])
+    found = find_photos(names, homes, given=images, sizes=[camera.size for camera in cameras])
     splits = {**dict.fromkeys(train, "train"), **dict.fromkeys(held_out, "val")} if held_out else {}
     poses, frames = FramePoses(), []
-    for name, (camera, record), image in zip(names, views, found.paths, strict=True):
-        where = str(folder / CAMERAS / f"{name}.json")
+    for name, camera, record, place in zip(names, cameras, records, found.places, strict=True):
+        where = str(files[name])
         pose = poses.read(name, f"{where}: orientation", partial(_pose, record, where))
-        if pose is None:
-            continue
-        place = image or (images or homes[0]) / name
-        frames.append(Frame(place.name, camera, pose, image=place, split=splits.get(name)))
+        if pose is not None:
+            place = place or homes[0] / name
+            frames.append(Frame(place.name, camera, pose, image=place, split=splits.get(name)))
     if not frames:
         raise malformed(str(folder), f"has no file in {CAMERAS}/ of the photos in {DATASET}", "copy the whole capture")
-    notes = (*found.notes, *poses.notes())
-    if unposed:
-        notes += (f"{several(len(unposed), 'photo')} without a camera left out: {listed(unposed)}",)
+    notes = (*found.notes, *poses.notes(), *without(unposed, "a camera"))
     bounds = _depth_bounds(folder / "scene.json", len(frames))
     return Capture(tuple(frames), _points(folder / "points.npy"), depth_bounds=bounds, kind="nerfies", notes=notes)
 
@@ -113,10 +110,7 @@ def _terms(record: dict[str, Any], keys: tuple[str, ...], count: int, where: str
 
 
 def _pose(record: dict[str, Any], where: str) -> np.ndarray:
-    rows = record.get("orientation")
-    if not isinstance(rows, list) or len(rows) != 3:
-        raise malformed(where, f"orientation is {shown(rows)}", "expected 3 rows of 3 numbers")
-    rotation = np.stack([vector({"orientation": row}, "orientation", 3, where) for row in rows])
+    rotation = matrix(record, "orientation", (3,), 3, where)
     position = vector(record, "position", 3, where)
     return np.column_stack([rotation.T, position])
 

@@ -11,12 +11,12 @@ Source: openMVG/openMVG src/openMVG: sfm/sfm_data_io_cereal.cpp, sfm/sfm_view_io
 """
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture, Observations
@@ -24,6 +24,7 @@ from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import (
     check_unique_names,
     malformed,
+    matrix,
     name_of,
     number,
     read_json_object,
@@ -33,9 +34,8 @@ from nerfcli.captures.formats.fields import (
     vector,
 )
 from nerfcli.captures.formats.format import Format, has_keys, named
-from nerfcli.captures.formats.limits import plausible, rigid_pose
-from nerfcli.captures.formats.photo_names import find_photos
-from nerfcli.errors import listed, several
+from nerfcli.captures.formats.limits import FramePoses, plausible, without
+from nerfcli.captures.formats.photo_names import with_photos
 
 FILES = ("sfm_data.json", *(f"reconstruction{name}/sfm_data.json" for name in ("", "_sequential", "_global")))
 
@@ -64,34 +64,28 @@ def parse_openmvg(path: Path, *, images: Path | None = None) -> Capture:
     """
     content = read_json_object(path)
     cameras = _cameras(content, path)
-    poses = {key: _pose(value, where) for key, value, where in _entries(content, "extrinsics", path)}
-    views, unposed = [], []
+    usable = FramePoses()
+    poses = {
+        key: usable.read(f"pose {key}", f"{where}: rotation", partial(_matrix, value, where))
+        for key, value, where in _entries(content, "extrinsics", path)
+    }
+    frames, frame_of, unposed = [], dict[int, int](), []
     for key, value, where in _entries(content, "views", path):
         view = _data(value, where)
         parts = (view.get("local_path") or "", view.get("filename"))
         name = "/".join(name_of(part, where).strip("/") for part in parts if part != "")
-        pose, intrinsics = view.get("id_pose"), view.get("id_intrinsic")
-        if pose in poses and intrinsics in cameras:
-            views.append((key, name, cameras[intrinsics], poses[pose]))
-        else:
+        pose, camera = poses.get(view.get("id_pose")), cameras.get(view.get("id_intrinsic"))
+        if pose is None or camera is None:
             unposed.append(name)
-    check_unique_names((name for _, name, _, _ in views), path)
-    homes = [path.parent / name_of(content.get("root_path") or ".", str(path)), path.parent, path.parent.parent]
-    found = find_photos(
-        [name for _, name, _, _ in views],
-        [home for home in homes if home.is_dir()],
-        given=images,
-        sizes=[camera.size for _, _, camera, _ in views],
-    )
-    frames = tuple(
-        Frame(name, camera, pose, image=image or (found.folder or path.parent) / name)
-        for (_, _, camera, pose), name, image in zip(views, found.names, found.paths, strict=True)
-    )
-    points, observations = _structure(content, {key: index for index, (key, *_) in enumerate(views)}, path)
-    notes = found.notes
-    if unposed:
-        notes += (f"{several(len(unposed), 'photo')} without a pose left out: {listed(unposed)}",)
-    return Capture(frames, points, kind="openmvg", observations=observations, notes=notes)
+            continue
+        frame_of[key] = len(frames)
+        frames.append(Frame(name, camera, pose, image=path.parent / name))
+    check_unique_names((frame.name for frame in frames), path)
+    points, observations = _structure(content, frame_of, path)
+    notes = (*usable.notes(), *without(unposed, "a pose"))
+    capture = Capture(tuple(frames), points, kind="openmvg", observations=observations, notes=notes)
+    home = path.parent / name_of(content.get("root_path") or ".", str(path))
+    return with_photos(capture, home, path.parent, path.parent.parent, given=images)
 
 
 def _entries(content: dict[str, Any], key: str, home: Path | str) -> Iterator[tuple[int, dict[str, Any], str]]:
@@ -140,14 +134,9 @@ def _camera(kind: Any, data: dict[str, Any], where: str) -> Camera:
     return lenses.brown_camera(size, focal, (x, y), radial=(k1, k2, k3), tangential=(p1, p2), where=where)
 
 
-def _pose(value: dict[str, Any], where: str) -> np.ndarray:
-    rows = value.get("rotation")
-    if not isinstance(rows, list) or len(rows) != 3:
-        raise malformed(where, f"rotation is {shown(rows)}", "expected 3 rows of 3 numbers")
-    rotation = np.stack([vector({"rotation": row}, "rotation", 3, where) for row in rows])
-    centre = vector(value, "center", 3, where)
-    turned = rigid_pose(np.column_stack([rotation.T, centre]), f"{where}: rotation")
-    return rigid.from_parts(turned[:3, :3], centre)
+def _matrix(value: dict[str, Any], where: str) -> np.ndarray:
+    """Return the first three rows of world_from_cam, (3, 4)."""
+    return np.column_stack([matrix(value, "rotation", (3,), 3, where).T, vector(value, "center", 3, where)])
 
 
 def _structure(content: dict[str, Any], frame_of: dict[int, int], path: Path) -> tuple[np.ndarray, Observations | None]:

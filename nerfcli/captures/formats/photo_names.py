@@ -41,6 +41,12 @@ class FoundPhotos:
     notes: tuple[str, ...]
 
     @property
+    def places(self) -> tuple[Path | None, ...]:
+        """The photos; of those that are missing, where they should be, or None without a folder of photos."""
+        expected = (None if self.folder is None else self.folder / name for name in self.names)
+        return tuple(path or place for path, place in zip(self.paths, expected, strict=True))
+
+    @property
     def missing(self) -> tuple[str, ...]:
         """The names of photos that are not on disk."""
         return tuple(name for name, path in zip(self.listed, self.paths, strict=True) if path is None)
@@ -121,15 +127,17 @@ def find_photos(
     return _described(names, best)
 
 
-def with_photos(capture: Capture, *homes: Path, given: Path | None = None) -> Capture:
+def with_photos(
+    capture: Capture, *homes: Path, given: Path | None = None, folders: Sequence[str] = ("images",)
+) -> Capture:
     """Return the capture with its photos found by the frames' names, see `find_photos`; what was done is noted."""
     sizes = [frame.camera.size for frame in capture.frames]
-    found = find_photos([frame.name for frame in capture.frames], homes, given=given, sizes=sizes)
-    frames = []
-    for frame, name, path in zip(capture.frames, found.names, found.paths, strict=True):
-        expected = frame.image if found.folder is None else found.folder / name
-        frames.append(replace(frame, name=name, image=path or expected))
-    return replace(capture, frames=tuple(frames), notes=(*capture.notes, *found.notes))
+    found = find_photos([frame.name for frame in capture.frames], homes, given=given, folders=folders, sizes=sizes)
+    frames = tuple(
+        replace(frame, name=name, image=place or frame.image)
+        for frame, name, place in zip(capture.frames, found.names, found.places, strict=True)
+    )
+    return replace(capture, frames=frames, notes=(*capture.notes, *found.notes))
 
 
 def seen_from(folder: Path, path: Path | None) -> str:

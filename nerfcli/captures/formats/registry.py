@@ -100,8 +100,7 @@ def recognise(path: Path) -> tuple[Format, Path]:
         raise UserError(f"{path} does not exist", "give a capture: a file or folder of cameras, or a scene folder")
     if (found := recognised(path)) is not None:
         return found
-    if path.is_file() and path.suffix.lower() in ARCHIVES:
-        raise UserError(f"{path} is an archive", f"unpack it with: nerfcli convert {in_shell(path)} SCENE --to nerfcli")
+    refuse_archive(path)
     if inside := _captures_in(path):
         more = f" and in {several(len(inside) - 1, 'other folder')}" if len(inside) > 1 else ""
         raise UserError(f"{path} contains no capture", f"there is one in {in_shell(inside[0])}{more}: give that folder")

@@ -47,10 +47,9 @@ def parse_scanner_app(folder: Path, measure: Measure, *, images: Path | None = N
     files = frame_files(folder)
     found = find_photos([path.stem for path in files], [folder], given=images)
     found = found.required(str(folder), "they give the sizes of the pictures")
-    fits, poses, frames, without = Fits(), FramePoses(), [], 0
+    fits, poses, frames = Fits(), FramePoses(), []
     for path, image in zip(files, found.paths, strict=True):
         if image is None:
-            without += 1
             continue
         where, record = str(path), read_json_object(path)
         matrix = vector(record, "intrinsics", 9, where).reshape(3, 3)
@@ -61,7 +60,7 @@ def parse_scanner_app(folder: Path, measure: Measure, *, images: Path | None = N
             found_depth = SensorDepth.found(depth, unit=MILLIMETRE, confidence=confidence)
             frames.append(Frame(image.name, camera, opencv_from_opengl_pose(pose), image=image, depth=found_depth))
     notes = (*found.notes, *poses.notes(), *fits.notes())
-    if without:
+    if found.missing:
         notes += (f"{len(frames)} of the {len(files)} frames with a pose have a photo",)
     source = "ARKit (3D Scanner App)"
     return Capture(

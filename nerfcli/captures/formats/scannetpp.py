@@ -7,21 +7,18 @@ are blurred or show a shadow of the photographer. dslr/colmap is a COLMAP model,
 Source: scannetpp/scannetpp common/utils/nerfstudio.py, common/scene_release.py; nerfstudio scannetpp_dataparser.py.
 """
 
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from nerfcli.cameras.conventions import opencv_from_opengl_pose
-from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, read_json_object, shown, vector
+from nerfcli.captures.formats.fields import check_unique_names, malformed, read_json_object
 from nerfcli.captures.formats.format import Format, has_keys
-from nerfcli.captures.formats.lens_fits import Fits
-from nerfcli.captures.formats.limits import FramePoses
-from nerfcli.captures.formats.photo_names import find_photos
-from nerfcli.captures.formats.transforms_cameras import camera_of_record, given_size
+from nerfcli.captures.formats.photo_search import plain_name
+from nerfcli.captures.formats.transforms import listed_frames, records_of
+from nerfcli.captures.orientation import Measure
+from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import several
 
 FILES = ("transforms.json", "transforms_undistorted.json")
@@ -30,7 +27,7 @@ _HELD_OUT = "test_frames"
 _SPLITS = {"frames": "train", _HELD_OUT: "test"}
 
 
-def parse_scannetpp(path: Path, *, images: Path | None = None) -> Capture:
+def parse_scannetpp(path: Path, measure: Measure, *, images: Path | None = None) -> Capture:
     """Read the photos of both lists that are not marked as bad, with their masks where these are on disk.
 
     Args:
@@ -42,61 +39,26 @@ def parse_scannetpp(path: Path, *, images: Path | None = None) -> Capture:
     content = read_json_object(path)
     kind = "undistorted" if "undistorted" in path.stem else "resized"
     home = path.parent.parent if path.parent.name == "nerfstudio" else path.parent
-    records, bad = [], 0
-    for key, split in _SPLITS.items():
-        for record, where in _records(content, key, path):
-            if record.get("is_bad") is True:
-                bad += 1
-            else:
-                records.append(({**content, **record}, split, where))
-    has_split = any(split == "test" for _, split, _ in records)
-    names = [name_of(record.get("file_path"), where) for record, _, where in records]
-    check_unique_names(names, path)
-    sizes = [_size(record, where) for record, _, where in records]
-    found = find_photos(names, [home], given=images, folders=(f"{kind}_images", "images"), sizes=sizes)
-    fits, poses, frames = Fits(), FramePoses(), []
-    for (record, split, where), size, name, image in zip(records, sizes, found.names, found.paths, strict=True):
-        pose = poses.read(name, f"{where}: transform_matrix", partial(_matrix, record, where))
-        if pose is None:
-            continue
-        mask = record.get("mask_path")
-        mask = home / f"{kind}_anon_masks" / name_of(mask, f"{where}: mask_path") if mask else None
-        frames.append(
-            Frame(
-                name,
-                camera_of_record(record, size, where, fits),
-                opencv_from_opengl_pose(pose),
-                image=image or (images or home / f"{kind}_images") / name,
-                mask=mask if mask is not None and mask.is_file() else None,
-                split=split if has_split else None,
-            )
-        )
-    notes = (*found.notes, *poses.notes(), *fits.notes())
-    if bad:
-        notes += (f"{several(bad, 'photo')} marked as bad left out",)
+    folders = (f"{kind}_images", f"{kind}_anon_masks")
+    both = [
+        (record, where, split)
+        for key, split in _SPLITS.items()
+        for record, where in (records_of(path, content, key) if content.get(key) != [] else [])
+    ]
+    good = [(record, where) for record, where, _ in both if record.get("is_bad") is not True]
+    if not good:
+        raise malformed(str(path), "marks all photos as bad", "copy the scene again")
+    frames, missing, notes = listed_frames(path, content, good, measure, images=images, home=home, folders=folders)
+    check_unique_names((frame.name for frame in frames), path)
+    split_of = {plain_name(str(record.get("file_path"))): split for record, _, split in both}
+    if "test" in (splits := [split_of.get(frame.name) for frame in frames]):
+        frames = [replace(frame, split=split) for frame, split in zip(frames, splits, strict=True)]
+    if len(good) < len(both):
+        notes += (f"{several(len(both) - len(good), 'photo')} marked as bad left out",)
     points, source = np.zeros((0, 3)), "laser scan (ScanNet++)"
-    return Capture(tuple(frames), points, kind="scannetpp", unit="metre", unit_source=source, notes=notes)
-
-
-def _records(content: dict[str, Any], key: str, path: Path) -> list[tuple[dict[str, Any], str]]:
-    records = content.get(key)
-    if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
-        raise malformed(str(path), f"{key} is {shown(records)}", "expected a list of frames")
-    return [(record, f"{path}: {key}[{index}]") for index, record in enumerate(records)]
-
-
-def _size(record: dict[str, Any], where: str) -> tuple[int, int]:
-    size = given_size(record, where)
-    if size is None:
-        raise malformed(where, "w and h are missing", "expected the size of the photos in pixels")
-    return size
-
-
-def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
-    rows = record.get("transform_matrix")
-    if not isinstance(rows, list) or len(rows) not in (3, 4):
-        raise malformed(where, f"transform_matrix is {shown(rows)}", "expected 4 rows of 4 numbers")
-    return np.stack([vector({"transform_matrix": row}, "transform_matrix", 4, where) for row in rows])
+    return Capture(
+        tuple(frames), points, tuple(missing), kind="scannetpp", unit="metre", unit_source=source, notes=notes
+    )
 
 
 def find_scannetpp(path: Path) -> Path | None:
@@ -114,6 +76,6 @@ FORMAT = Format(
     "ScanNet++",
     "dslr/nerfstudio/transforms.json",
     find_scannetpp,
-    lambda path, given: parse_scannetpp(path, images=given.images),
+    lambda path, given: parse_scannetpp(path, measure, images=given.images),
     axes="opengl",
 )

@@ -8,16 +8,17 @@ depth/000123.png (16 bits, millimetres, 0 is unknown) and confidence/000123.png 
 Source: StrayRobots/scanner docs/format.md, StrayScanner/Helpers/OdometryEncoder.swift and DatasetEncoder.swift.
 """
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth, Size
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, numbers, read_text
+from nerfcli.captures.formats.fields import check_unique_names, malformed, numbers, read_rows
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.lens_fits import Fits
-from nerfcli.captures.formats.limits import quaternion_pose
+from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import GIVE_PHOTOS, FoundPhotos, find_photos
 from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
@@ -47,23 +48,24 @@ def parse_stray_scanner(folder: Path, measure: Measure, *, images: Path | None =
     found = _photos(list(rows), folder, images)
     there = [image for image in found.paths if image is not None]
     size = stored_size(there[0], measure) if there else _size_of_video(folder)
-    has_lenses = all(key in row for row in rows.values() for key in _LENS)
+    has_lenses = all(key in row for row, _ in rows.values() for key in _LENS)
     matrix = np.eye(3) if has_lenses else _matrix(folder / MATRIX)
-    fits, frames = Fits(), []
-    for row, name, image in zip(rows.values(), found.names, found.paths, strict=True):
+    fits, poses, frames = Fits(), FramePoses(), []
+    for (index, (row, where)), name, image in zip(rows.items(), found.names, found.paths, strict=True):
         if image is None and there:
             continue
-        where = f"{path}: frame {int(row['frame'])}"
         if has_lenses:
-            matrix = np.array([[row["fx"], 0, row["cx"]], [0, row["fy"], row["cy"]], [0, 0, 1]])
-        pose = np.array([row[key] for key in _POSE])
+            fx, fy, cx, cy = numbers([row[key] for key in _LENS], 4, where)
+            matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        pose = poses.read_quaternion(name, where, partial(_parts, row, where))
+        if pose is None:
+            continue
         camera = fits.matrix(matrix, size, where if has_lenses else str(folder / MATRIX))
-        world_from_cam = quaternion_pose(pose[:4], pose[4:], where)
-        maps, number = folder / "depth", f"{int(row['frame']):06d}.png"
+        maps, number = folder / "depth", f"{index:06d}.png"
         depth = SensorDepth.found(maps / number, unit=MILLIMETRE, confidence=folder / "confidence" / number)
-        frames.append(Frame(name if image is None else image.name, camera, world_from_cam, image=image, depth=depth))
+        frames.append(Frame(name if image is None else image.name, camera, pose, image=image, depth=depth))
     check_unique_names((frame.name for frame in frames), path)
-    notes = (*found.notes, *fits.notes())
+    notes = (*found.notes, *poses.notes(), *fits.notes())
     if there and len(there) < len(rows):
         notes += (f"{len(there)} of the {len(rows)} frames with a pose have a photo",)
     return Capture(
@@ -76,24 +78,31 @@ def parse_stray_scanner(folder: Path, measure: Measure, *, images: Path | None =
     )
 
 
+def _parts(row: dict[str, str], where: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the quaternion xyzw and the position of a pose."""
+    values = np.array(numbers([row[key] for key in _POSE], len(_POSE), where))
+    return values[:4], values[4:]
+
+
 def _matrix(path: Path) -> np.ndarray:
-    lines = content_lines(read_text(path, "expected 3 lines of 3 numbers"))
-    if len(lines) != 3:
-        raise malformed(str(path), f"has {several(len(lines), 'line')}", "expected a matrix: 3 lines of 3 numbers")
-    return np.array([numbers(line.split(","), 3, f"{path}: line {index}") for index, line in lines])
+    rows = read_rows(path, "expected 3 lines of 3 numbers", separator=",")
+    if len(rows) != 3:
+        raise malformed(str(path), f"has {several(len(rows), 'line')}", "expected a matrix: 3 lines of 3 numbers")
+    return np.array([numbers(cells, 3, where) for cells, where in rows])
 
 
-def _rows(path: Path) -> dict[int, dict[str, float]]:
-    """Return the numbers of each row by the names of their columns, by the number of the frame."""
-    lines = content_lines(read_text(path, _EXPECTED))
-    header = [word.strip().lower() for word in lines[0][1].split(",")] if lines else []
+def _rows(path: Path) -> dict[int, tuple[dict[str, str], str]]:
+    """Return the cells of each row by the names of their columns, and its place, by the number of the frame."""
+    lines = read_rows(path, _EXPECTED, separator=",")
+    header = [word.lower() for word in lines[0].cells] if lines else []
     if missing := [key for key in ("frame", *_POSE) if key not in header]:
         raise malformed(str(path), f"has no column {missing[0]}", _EXPECTED)
     rows = {}
-    for line_number, line in lines[1:]:
-        values = numbers([word.strip() for word in line.split(",")], len(header), f"{path}: line {line_number}")
-        row = dict(zip(header, values, strict=True))
-        rows[int(row["frame"])] = row
+    for cells, where in lines[1:]:
+        if len(cells) != len(header):
+            raise malformed(where, f"has {len(cells)} cells", f"expected {len(header)}, as in the first line")
+        row = dict(zip(header, cells, strict=True))
+        rows[int(numbers([row["frame"]], 1, where)[0])] = row, where
     return rows
 
 

@@ -1,9 +1,13 @@
 """Poses that are measured at other times than photos are taken: interpolated to the time of each photo."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
+from nerfcli.captures.formats.fields import malformed
+from nerfcli.captures.formats.limits import without
 
 # Poses are interpolated between two that are at most this far apart; trackers and motion capture run at 30 to 200 Hz.
 MOST_GAP_SECONDS = 0.1
@@ -38,3 +42,18 @@ def poses_at(seconds: np.ndarray, world_from_body: np.ndarray, wanted: np.ndarra
     rotations = low[:, :3, :3] @ Rotation.from_rotvec(weight * turn).as_matrix()
     result[is_between] = rigid.from_parts(rotations, (1 - weight) * low[:, :3, 3] + weight * high[:, :3, 3])
     return result, is_between | (away <= MOST_AWAY_SECONDS)
+
+
+def photos_at(
+    names: Sequence[str], seconds: Sequence[float], times: Sequence[float], world_from_body: np.ndarray, *, where: str
+) -> tuple[list[int], np.ndarray, tuple[str, ...]]:
+    """Return the numbers of the photos with a pose at their time, these poses (N, 4, 4), and a note on the others.
+
+    Raises:
+        UserError: no photo has one; `where` is the file of the poses.
+    """
+    poses, is_known = poses_at(np.array(times), world_from_body, np.array(seconds))
+    if not is_known.any():
+        raise malformed(where, "has no pose at the time of a photo", "copy the whole sequence")
+    unposed = [names[index] for index in np.flatnonzero(~is_known)]
+    return np.flatnonzero(is_known).tolist(), poses[is_known], without(unposed, "a pose near in time")

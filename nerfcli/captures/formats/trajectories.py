@@ -7,6 +7,7 @@ Sources: cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats; cvlibs.net/data
 
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +18,12 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import (
+    Row,
     check_unique_names,
-    content_lines,
     malformed,
     numbers,
     opened,
-    read_text,
+    read_rows,
     shown,
 )
 from nerfcli.captures.formats.format import Format
@@ -33,6 +34,9 @@ from nerfcli.errors import UserError
 
 _TUM_EXPECTED = "expected lines of timestamp tx ty tz qx qy qz qw"
 _KITTI_EXPECTED = "expected lines of 12 numbers, the first three rows of a 4x4 matrix"
+
+# Names and poses `world_from_cam`, and notes.
+Poses = tuple[list[tuple[str, np.ndarray]], tuple[str, ...]]
 
 _NUMBER = re.compile(r"[+-]?\d{1,20}(\.\d{0,20})?([eE][+-]?\d{1,2})?", re.ASCII)
 _PICTURE = re.compile(r"\.(png|jpe?g|tiff?|bmp|webp)$", re.IGNORECASE)
@@ -47,7 +51,7 @@ def parse_tum(path: Path, camera: Camera | None) -> Capture:
     Raises:
         UserError: the file is damaged (file and line are named), or no camera is given.
     """
-    return _parse(path, camera, _tum_pose, expected=_TUM_EXPECTED, kind="tum")
+    return _capture(path, camera, tum_poses, kind="tum")
 
 
 def parse_kitti(path: Path, camera: Camera | None) -> Capture:
@@ -55,7 +59,7 @@ def parse_kitti(path: Path, camera: Camera | None) -> Capture:
 
     `camera` and the errors are those of `parse_tum`.
     """
-    return _parse(path, camera, _kitti_pose, expected=_KITTI_EXPECTED, kind="kitti")
+    return _capture(path, camera, _kitti_poses, kind="kitti")
 
 
 def losses_tum(capture: Capture) -> tuple[str, ...]:
@@ -96,73 +100,57 @@ def write_kitti(capture: Capture, path: Path) -> None:
     _write([" ".join(map(repr, row)) for row in rows], path)
 
 
-def _parse(
-    path: Path,
-    camera: Camera | None,
-    pose_of: Callable[[FramePoses, int, list[str], str], tuple[str, np.ndarray | None]],
-    *,
-    expected: str,
-    kind: str,
-) -> Capture:
+def _capture(path: Path, camera: Camera | None, read: Callable[[Path], Poses], *, kind: str) -> Capture:
     if camera is None:
-        raise UserError(
-            f"{path}: a {kind.upper()} trajectory contains poses but no camera",
-            GIVE_CAMERA,
-        )
-    poses, notes = _poses(path, pose_of, expected=expected)
+        raise UserError(f"{path}: a {kind.upper()} trajectory contains poses but no camera", GIVE_CAMERA)
+    poses, notes = read(path)
     check_unique_names((name for name, _ in poses), path)
     frames = tuple(Frame(name, camera, world_from_cam) for name, world_from_cam in poses)
     return Capture(frames, np.zeros((0, 3)), kind=kind, notes=notes)
 
 
-def timed_lines(text: str) -> list[tuple[int, str]]:
-    """Return what `content_lines` returns, without a line of names that has lost its "#"."""
-    return [(number, line) for number, line in content_lines(text) if not line.lower().lstrip().startswith("timestamp")]
+def timed_rows(path: Path, expected: str) -> list[Row]:
+    """Return what `read_rows` returns, without a line of names that has lost its "#"."""
+    return [row for row in read_rows(path, expected) if not row.cells[0].lower().startswith("timestamp")]
 
 
-def tum_poses(path: Path) -> tuple[list[tuple[str, np.ndarray]], tuple[str, ...]]:
+def tum_poses(path: Path) -> Poses:
     """Read the timestamps and poses `world_from_cam` of a trajectory in the TUM format, and notes of what was left out.
 
     Raises:
         UserError: the file is damaged; file and line are named.
     """
-    return _poses(path, _tum_pose, expected=_TUM_EXPECTED)
+    usable, poses = FramePoses(), []
+    for cells, where in timed_rows(path, _TUM_EXPECTED):
+        if len(cells) != 8:
+            raise malformed(where, f"has {len(cells)} numbers", "expected 8")
+        if not _NUMBER.fullmatch(cells[0]):
+            raise malformed(where, f"its timestamp is {shown(cells[0])}", "expected seconds, such as 1305031102.1753")
+        poses.append((cells[0], usable.read_quaternion(cells[0], where, partial(_tum_parts, cells[1:], where))))
+    return _usable(poses, usable, path, _TUM_EXPECTED)
 
 
-def _poses(
-    path: Path,
-    pose_of: Callable[[FramePoses, int, list[str], str], tuple[str, np.ndarray | None]],
-    *,
-    expected: str,
-) -> tuple[list[tuple[str, np.ndarray]], tuple[str, ...]]:
-    read, poses = FramePoses(), []
-    for index, (number, line) in enumerate(timed_lines(read_text(path, expected))):
-        name, world_from_cam = pose_of(read, index, line.split(), f"{path}: line {number}")
-        if world_from_cam is not None:
-            poses.append((name, world_from_cam))
-    notes = read.notes()
+def _tum_parts(words: list[str], where: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the quaternion xyzw and the position of a pose."""
+    values = np.array(numbers(words, 7, where))
+    return values[3:], values[:3]
+
+
+def _kitti_poses(path: Path) -> Poses:
+    usable, poses = FramePoses(), []
+    for index, (cells, where) in enumerate(read_rows(path, _KITTI_EXPECTED)):
+        poses.append((_indexed(index), usable.read(_indexed(index), where, partial(_kitti_matrix, cells, where))))
+    return _usable(poses, usable, path, _KITTI_EXPECTED)
+
+
+def _kitti_matrix(words: list[str], where: str) -> np.ndarray:
+    return np.array(numbers(words, 12, where)).reshape(3, 4)
+
+
+def _usable(poses: list[tuple[str, np.ndarray | None]], usable: FramePoses, path: Path, expected: str) -> Poses:
     if not poses:
         raise malformed(str(path), "has no pose", expected)
-    return poses, notes
-
-
-def _tum_pose(poses: FramePoses, _: int, words: list[str], where: str) -> tuple[str, np.ndarray | None]:
-    if len(words) != 8:
-        raise malformed(where, f"has {len(words)} numbers", "expected 8")
-
-    def parts() -> tuple[np.ndarray, np.ndarray]:
-        values = np.array(numbers(words[1:], 7, where))
-        return values[3:], values[:3]
-
-    world_from_cam = poses.read_quaternion(words[0], where, parts)
-    if not _NUMBER.fullmatch(words[0]):
-        raise malformed(where, f"its timestamp is {shown(words[0])}", "expected seconds, such as 1305031102.1753")
-    return words[0], world_from_cam
-
-
-def _kitti_pose(poses: FramePoses, index: int, words: list[str], where: str) -> tuple[str, np.ndarray | None]:
-    name = _indexed(index)
-    return name, poses.read(name, where, lambda: np.array(numbers(words, 12, where)).reshape(3, 4))
+    return [(name, pose) for name, pose in poses if pose is not None], usable.notes()
 
 
 def _indexed(index: int) -> str:

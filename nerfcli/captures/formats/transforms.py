@@ -4,7 +4,7 @@ Poses in these files are world_from_cam with OpenGL axes. Pixel positions are as
 Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips.md and scripts/colmap2nerf.py.
 """
 
-from collections import Counter
+from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -19,10 +19,10 @@ from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth, Size
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.alicevision import find_alicevision
 from nerfcli.captures.formats.camera_path import find_camera_path
-from nerfcli.captures.formats.fields import malformed, read_json_object
+from nerfcli.captures.formats.fields import check_unique_names, malformed, matrix, read_json_object
 from nerfcli.captures.formats.format import Format, find_json
 from nerfcli.captures.formats.lens_fits import Fits
-from nerfcli.captures.formats.limits import FramePoses, NotFiniteError
+from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos, seen_from
 from nerfcli.captures.formats.photo_search import plain_name
 from nerfcli.captures.formats.ply import read_points, write_points
@@ -37,7 +37,8 @@ from nerfcli.captures.formats.transforms_cameras import (
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts
 from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
-from nerfcli.errors import UserError, listed, several
+from nerfcli.errors import UserError, several
+from nerfcli.errors import listed as in_words
 
 SPLITS = ("train", "val", "test")
 
@@ -58,8 +59,8 @@ def parse_transforms(path: Path, measure: Measure | None = None, *, images: Path
         UserError: the file, or the PLY file of points that it names, is malformed or missing; file and field are named.
     """
     content = read_json_object(path)
-    frames, missing, notes = listed_frames(path, content, measure, images=images)
-    check_unique_names(path, frames)
+    frames, missing, notes = listed_frames(path, content, records_of(path, content), measure, images=images)
+    check_unique_names((frame.name for frame in frames), path)
     points, colours, lost = _points_beside(path, content)
     return Capture(tuple(frames), points, tuple(missing), kind="transforms", colours=colours, notes=(*notes, *lost))
 
@@ -113,87 +114,93 @@ def write_transforms(capture: Capture, path: Path) -> None:
         undo.pop_all()
 
 
-def records_of(path: Path, content: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the entries of the list `frames`.
+def records_of(path: Path, content: dict[str, Any], key: str = "frames") -> list[tuple[dict[str, Any], str]]:
+    """Return the entries of a list of frames, with the keys of the whole file, and their places in it.
 
     Raises:
         UserError: there is no such list, or it is empty.
     """
-    records = content.get("frames")
+    records = content.get(key)
     if not isinstance(records, list) or not records or not all(isinstance(item, dict) for item in records):
         raise malformed(
-            str(path), "has no list of frames", 'expected "frames": [{"file_path", "transform_matrix"}, ...]'
+            str(path), f"has no list of {key}", f'expected "{key}": [{{"file_path", "transform_matrix"}}, ...]'
         )
-    return records
+    return [({**content, **record}, f"{path}: {key}[{index}]") for index, record in enumerate(records)]
 
 
 def listed_frames(
     path: Path,
     content: dict[str, Any],
+    listed: Sequence[tuple[dict[str, Any], str]],
     measure: Measure | None,
     *,
     suffix: str = "",
     images: Path | None = None,
     size: Size | None = None,
+    home: Path | None = None,
+    folders: tuple[str, str] = ("images", "masks"),
 ) -> tuple[list[Frame], list[str], tuple[str, ...]]:
     """Return the frames of a file as listed, the names of images whose size is unknown, which have no frame, and notes.
 
     Frames with equal intrinsics share one camera. Masks that are not on disk are left out.
 
     Args:
+        listed: the frames, see `records_of`.
         measure: returns an image's size, if the file does not give it. An image that is not on disk either gets the
             size of the other images, if they all have the same; if none has one, it is an error.
         suffix: appended to a file_path without a suffix if no such image is on disk, as the format does.
         images: the folder of the images, if they are not where the file says.
         size: of the images, if the file does not give it and none is on disk.
+        home: the folder that paths are relative to; by default that of the file.
+        folders: the usual names of the folders of images and masks in it.
     """
-    records = records_of(path, content)
-    merged = [{**content, **record} for record in records]
-    wheres = [f"{path}: frames[{index}]" for index in range(len(records))]
-    sizes = [given_size(record, where) for record, where in zip(merged, wheres, strict=True)]
-    is_path = not any("file_path" in record for record in records)  # the views of a camera path have no photo
+    home = home or path.parent
+    sizes = [given_size(record, where) for record, where in listed]
+    is_path = not any("file_path" in record for record, _ in listed)  # the views of a camera path have no photo
     texts = [
         _listed_path({"file_path": f"frame_{index:04d}"} if is_path else record, where)
-        for index, (record, where) in enumerate(zip(records, wheres, strict=True))
+        for index, (record, where) in enumerate(listed)
     ]
-    found = find_photos(texts, (path.parent,), given=images, sizes=sizes)
+    found = find_photos(texts, (home,), given=images, folders=folders[:1], sizes=sizes)
     names = [
         name if PurePosixPath(name).suffix else name + (suffix if image is None else image.suffix)
         for name, image in zip(found.names, found.paths, strict=True)
     ]
-    places = [image or path.parent / name for name, image in zip(names, found.paths, strict=True)]
-    known = _known_sizes(sizes, places, wheres[0], measure=measure, default=size)
-    masks, lost_masks = _masks(path, [record.get("mask_path") for record in merged], wheres, set(places))
+    places = [image or home / name for name, image in zip(names, found.paths, strict=True)]
+    known = _known_sizes(sizes, places, listed[0][1], measure=measure, default=size)
+    masks, lost_masks = _masks(path, listed, home, folders[1], photos=set(places))
     splits = _listed_splits(path, content)
     cameras: dict[Camera, Camera] = {}
     fits, poses = Fits(), FramePoses()
     frames, missing = [], []
-    for index, (record, where, own_size) in enumerate(zip(merged, wheres, known, strict=True)):
-        matrix = poses.read(names[index], f"{where}.transform_matrix", partial(_matrix, record, where))
+    for index, ((record, where), own_size) in enumerate(zip(listed, known, strict=True)):
+        read = partial(matrix, record, "transform_matrix", (3, 4), 4, where)
+        world_from_cam = poses.read(names[index], f"{where}.transform_matrix", read)
         if own_size is None:
             missing.append(names[index])
             continue
-        if matrix is None:
+        if world_from_cam is None:
             continue
-        camera, pose = camera_of_record(record, own_size, where, fits), opencv_from_opengl_pose(matrix)
-        split, depth = splits.get(plain_name(texts[index])), _listed_depth(path.parent, record, where)
+        camera, pose = camera_of_record(record, own_size, where, fits), opencv_from_opengl_pose(world_from_cam)
+        split, depth = splits.get(plain_name(texts[index])), _listed_depth(home, record, where)
         camera = cameras.setdefault(camera, camera)
         frames.append(Frame(names[index], camera, pose, places[index], masks[index], split=split, depth=depth))
     return frames, missing, (*found.notes, *poses.notes(), *fits.notes(), *lost_masks)
 
 
 def _masks(
-    path: Path, texts: list[Any], wheres: list[str], photos: set[Path]
+    path: Path, listed: Sequence[tuple[dict[str, Any], str]], home: Path, folder: str, *, photos: set[Path]
 ) -> tuple[list[Path | None], tuple[str, ...]]:
     """Return the mask of each frame, None without one or where it is not on disk, and what was left out."""
-    for mask, where in zip(texts, wheres, strict=True):
+    texts = [record.get("mask_path") for record, _ in listed]
+    for mask, (_, where) in zip(texts, listed, strict=True):
         if mask is not None and not isinstance(mask, str):
             raise malformed(where, f"mask_path is {mask!r:.80}", "expected the mask's path as text")
     named = {mask for mask in texts if mask}
-    found = find_photos(sorted(named), (path.parent,), folders=("masks",), others=())
+    found = find_photos(sorted(named), (home,), folders=(folder,), others=())
     paths = {name: image for name, image in zip(found.listed, found.paths, strict=True) if image not in photos}
     lost = sorted(name for name in named if paths.get(name) is None)
-    notes = (f"{several(len(lost), 'mask')} left out, which {path.name} names and do not exist: {listed(lost)}",)
+    notes = (f"{several(len(lost), 'mask')} left out, which {path.name} names and do not exist: {in_words(lost)}",)
     return [paths.get(mask) if mask else None for mask in texts], notes if lost else ()
 
 
@@ -226,33 +233,11 @@ def _known_sizes(
     return [next(iter(known)) if size is None and len(known) == 1 else size for size in sizes]
 
 
-def check_unique_names(path: Path, frames: list[Frame]) -> None:
-    """Raise a UserError where two frames have the same name."""
-    twice, count = Counter(frame.name for frame in frames).most_common(1)[0]
-    if count > 1:
-        raise UserError(f"{path}: image {twice} is listed twice", "remove one of its two entries in frames")
-
-
 def _listed_path(record: dict[str, Any], where: str) -> str:
     text = record.get("file_path")
     if not isinstance(text, str) or not PurePosixPath(plain_name(text)).name:
         raise malformed(where, f"file_path is {text!r:.80}", "expected the image's path as text")
     return text
-
-
-def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
-    """Return the matrix of a frame, (4, 4) or (3, 4)."""
-    if "transform_matrix" not in record:
-        raise malformed(where, "transform_matrix is missing", "expected 4 rows of 4 numbers, world from camera")
-    if record["transform_matrix"] is None:
-        raise NotFiniteError(f"{where}: transform_matrix is null", "expected 4 rows of 4 numbers, world from camera")
-    try:
-        matrix = np.array(record["transform_matrix"], dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise malformed(where, "transform_matrix is not a matrix", "expected 4 rows of 4 numbers") from error
-    if matrix.shape not in ((4, 4), (3, 4)):
-        raise malformed(where, f"transform_matrix has shape {matrix.shape}", "expected 4 rows of 4 numbers")
-    return matrix
 
 
 def _points_beside(path: Path, content: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:

@@ -4,11 +4,10 @@ Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips
 """
 
 import math
-from contextlib import suppress
 from typing import Any
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.captures.formats import lenses
+from nerfcli.captures.formats import fields, lenses
 from nerfcli.captures.formats.fields import malformed
 from nerfcli.captures.formats.lens_fits import Fits, Terms
 from nerfcli.captures.formats.limits import checked_camera
@@ -123,15 +122,7 @@ def number(record: dict[str, Any], key: str, where: str) -> float | None:
     Raises:
         UserError: the value is not a finite number.
     """
-    value = record.get(key)
-    if value is None:
-        return None
-    if isinstance(value, str):
-        with suppress(ValueError):
-            value = float(value)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:  # True at NaN
-        raise malformed(where, f"{key} is {value!r:.80}", "expected a finite number")
-    return float(value)
+    return None if record.get(key) is None else fields.number(record, key, where)
 
 
 def _focal(record: dict[str, Any], axis: str, size_px: int, where: str) -> float | None:

@@ -17,14 +17,14 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
-from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, numbers, read_text
+from nerfcli.captures.formats.fields import check_unique_names, name_of, numbers, read_text
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, find_photos
-from nerfcli.captures.formats.timed_poses import MOST_AWAY_SECONDS, poses_at
-from nerfcli.captures.formats.trajectories import timed_lines, tum_poses
+from nerfcli.captures.formats.timed_poses import MOST_AWAY_SECONDS, photos_at
+from nerfcli.captures.formats.trajectories import timed_rows, tum_poses
 from nerfcli.captures.orientation import Measure, stored_size
 from nerfcli.captures.stored_pixels import measure
-from nerfcli.errors import UserError, listed, several
+from nerfcli.errors import UserError
 
 PHOTOS, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
 # Metres of a level in depth maps.
@@ -56,36 +56,26 @@ def parse_tum_rgbd(
     seconds, names = _files_in_time(path)
     check_unique_names(names, path)
     poses, lost = tum_poses(folder / TRUTH)
-    times = np.array([float(name) for name, _ in poses])
-    interpolated, is_known = poses_at(times, np.stack([pose for _, pose in poses]), np.array(seconds))
-    kept, unposed = np.flatnonzero(is_known), [names[index] for index in np.flatnonzero(~is_known)]
-    if not len(kept):
-        raise malformed(str(folder / TRUTH), "has no pose at the time of a photo", "copy the whole sequence")
+    times, bodies = [float(name) for name, _ in poses], np.stack([pose for _, pose in poses])
+    kept, interpolated, unposed = photos_at(names, seconds, times, bodies, where=str(folder / TRUTH))
     found = find_photos([names[index] for index in kept], [folder], given=images)
     there = [image for image in found.paths if image is not None]
     size = stored_size(there[0], measure) if there else _KINECT_SIZE
     camera = _own_camera(folder, size) if camera is None else camera.resized(*size)
     depths = _depths(folder, seconds)
     frames = tuple(
-        Frame(name, camera, interpolated[index], image=image or (images or folder) / name, depth=depths[index])
-        for index, name, image in zip(kept, found.names, found.paths, strict=True)
+        Frame(name, camera, pose, image=place or folder / name, depth=depths[index])
+        for index, pose, name, place in zip(kept, interpolated, found.names, found.places, strict=True)
     )
-    notes = (*found.notes, *lost)
-    if unposed:
-        notes += (f"{several(len(unposed), 'photo')} left out, as no pose is near in time: {listed(unposed)}",)
-    points, source = np.zeros((0, 3)), "motion capture (TUM RGB-D)"
-    return Capture(frames, points, kind="tum-rgbd", unit="metre", unit_source=source, notes=notes)
+    source, notes = "motion capture (TUM RGB-D)", (*found.notes, *lost, *unposed)
+    return Capture(frames, np.zeros((0, 3)), kind="tum-rgbd", unit="metre", unit_source=source, notes=notes)
 
 
 def _files_in_time(path: Path) -> tuple[list[float], list[str]]:
     """Return the times and the files that a list names."""
-    seconds, names = [], []
-    for line_number, line in timed_lines(read_text(path, "expected lines of timestamp and file")):
-        where = f"{path}: line {line_number}"
-        time, _, file = line.strip().partition(" ")
-        seconds += numbers([time], 1, where)
-        names.append(name_of(file, where))
-    return seconds, names
+    rows = timed_rows(path, "expected lines of timestamp and file")
+    seconds = [numbers(cells[:1], 1, where)[0] for cells, where in rows]
+    return seconds, [name_of(" ".join(cells[1:]), where) for cells, where in rows]
 
 
 def _depths(folder: Path, seconds: list[float]) -> list[SensorDepth | None]:
