@@ -28,7 +28,6 @@ from nerfcli.captures.formats.record3d import parse_record3d
 from nerfcli.captures.formats.registry import depths_beside
 from nerfcli.captures.formats.scene_folder import parse_scene, write_scene
 from nerfcli.captures.formats.transforms import losses_transforms, parse_transforms, write_transforms
-from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import UserError
 from nerfcli.matching.stereo import DenseDepth
 from nerfcli.photos.loading import LoadedPhoto
@@ -373,7 +372,7 @@ def test_formats_name_the_maps_of_their_photos(tmp_path):
         (folder / pose).parent.mkdir(exist_ok=True)
         np.savetxt(folder / pose, np.eye(4))
         np.savetxt(folder / "intrinsics.txt", VIEWS.matrix)
-        capture = parse_pose_files(folder, measure)
+        capture = parse_pose_files(folder)
         assert [frame.depth for frame in capture.frames] == [SensorDepth(depth, 1e-3)]
         if "color/" in image:
             assert depths_beside(folder / "color") == {"0.png": SensorDepth(depth, 1e-3)}

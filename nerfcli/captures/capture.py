@@ -51,7 +51,7 @@ class Capture:
     """
 
     frames: tuple[Frame, ...]
-    points: np.ndarray
+    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     missing: tuple[str, ...] = ()
     depth_bounds: np.ndarray | None = None
     kind: str = ""

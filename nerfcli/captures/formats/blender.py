@@ -11,8 +11,6 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-import numpy as np
-
 from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opengl_from_opencv_pose
@@ -62,7 +60,7 @@ def parse_blender(
     if not frames:
         raise UserError(f"{_file(folder, 'train')}: No such file", "give a folder of transforms_{train,val,test}.json")
     check_unique_names((frame.name for frame in frames), folder)
-    return Capture(tuple(frames), np.zeros((0, 3)), tuple(missing), None, "blender", notes=tuple(notes))
+    return Capture(tuple(frames), missing=tuple(missing), kind="blender", notes=tuple(notes))
 
 
 def losses_blender(capture: Capture) -> tuple[str, ...]:

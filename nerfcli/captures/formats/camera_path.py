@@ -84,7 +84,7 @@ def read_path(path: Path) -> CameraPath:
 
 def parse_camera_path(path: Path) -> Capture:
     """Read the views of a camera path as a capture without pictures; see `read_path`."""
-    return Capture(read_path(path).frames, np.zeros((0, 3)), (), None, "camera-path")
+    return Capture(read_path(path).frames, kind="camera-path")
 
 
 def losses_camera_path(capture: Capture) -> tuple[str, ...]:

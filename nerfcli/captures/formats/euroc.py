@@ -21,6 +21,7 @@ from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import (
     check_unique_names,
     malformed,
+    matrix_of,
     name_of,
     numbers,
     read_rows,
@@ -68,7 +69,7 @@ def parse_euroc(home: Path, *, images: Path | None = None) -> Capture:
     )
     source = f"motion capture ({truth.parent.name})"
     notes = (*lost, *unposed)
-    capture = Capture(frames, np.zeros((0, 3)), kind="euroc", unit="metre", unit_source=source, notes=notes)
+    capture = Capture(frames, kind="euroc", unit="metre", unit_source=source, notes=notes)
     return with_photos(capture, home, given=images)
 
 
@@ -76,7 +77,8 @@ def _bodies(path: Path) -> tuple[list[int], np.ndarray, tuple[str, ...]]:
     """Return the times in nanoseconds and the poses world_from_body (N, 4, 4), and a note on what was left out."""
     times, poses, usable = [], [], FramePoses()
     for cells, where in read_rows(path, _EXPECTED, separator=","):
-        pose = usable.read_quaternion(cells[0], where, partial(_parts, cells, where))
+        xyzw_position = [*cells[5:8], *cells[4:5], *cells[1:4]]
+        pose = usable.read_quaternion(cells[0], where, partial(numbers, xyzw_position, 7, where))
         if pose is not None:
             times.append(_nanoseconds(cells[0], where))
             poses.append(pose)
@@ -84,12 +86,6 @@ def _bodies(path: Path) -> tuple[list[int], np.ndarray, tuple[str, ...]]:
     if not times:
         raise malformed(str(path), "has no pose", _EXPECTED)
     return times, np.stack(poses), notes
-
-
-def _parts(cells: list[str], where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the quaternion xyzw and the position of a pose."""
-    x, y, z, qw, *vector = numbers(cells[1:8], 7, where)
-    return np.array([*vector, qw]), np.array([x, y, z])
 
 
 def _pictures(path: Path) -> list[tuple[int, str]]:
@@ -109,7 +105,7 @@ def _sensor(path: Path) -> tuple[Camera, np.ndarray]:
     where = str(path)
     text = "\n".join(line.partition("#")[0] for line in read_text(path, _EXPECTED).splitlines())
     words = _words(text, r"T_BS\s*:[^\]]*?\bdata", f"{where}: T_BS")
-    body_from_cam = rigid_pose(np.array(numbers(words, 16, f"{where}: T_BS")).reshape(4, 4), f"{where}: T_BS")
+    body_from_cam = rigid_pose(matrix_of(words, 4, 4, f"{where}: T_BS"), f"{where}: T_BS")
     width, height = _numbers(text, "resolution", 2, where)
     size = size_of(width, height, where)
     fx, fy, cx, cy = _numbers(text, "intrinsics", 4, where)

@@ -164,6 +164,11 @@ def numbers(words: Sequence[str], count: int, where: str) -> list[float]:
     _refuse_number(words, where)
 
 
+def matrix_of(words: Sequence[str], rows: int, columns: int, where: str) -> np.ndarray:
+    """Return the matrix (rows, columns) of numbers in a text, row by row; errors as of `numbers`."""
+    return np.array(numbers(words, rows * columns, where)).reshape(rows, columns)
+
+
 def record_of(value: Any, where: str) -> dict[str, Any]:
     """Return a JSON object.
 

@@ -139,19 +139,17 @@ class FramePoses:
         scaled, scale = found
         return rigid.inverse(rigid_pose(np.column_stack([scaled[:3, :3], scaled[:3, 3] / scale]), where))
 
-    def read_quaternion(
-        self, name: str, where: str, parts: Callable[[], tuple[np.ndarray, np.ndarray]]
-    ) -> np.ndarray | None:
+    def read_quaternion(self, name: str, where: str, values: Callable[[], Sequence[float]]) -> np.ndarray | None:
         """Return the pose (4, 4) of a frame from the quaternion xyzw and the position in the file; None if unusable."""
         self._count += 1
         try:
-            xyzw, position = parts()
-            if not xyzw.any():
+            pose = np.array(values())  # (7,)
+            if not pose[:4].any():
                 raise NotFiniteError(f"{where}: its quaternion has length 0", "expected length 1")
         except NotFiniteError as error:
             self._lost.append((name, error))
             return None
-        return quaternion_pose(xyzw, position, where)
+        return quaternion_pose(pose[:4], pose[4:], where)
 
     def notes(self) -> tuple[str, ...]:
         """Return what was left out and normalised, for people.

@@ -61,7 +61,7 @@ def parse_llff(folder: Path, *, images: Path | None = None) -> Capture:
         for index, camera in zip(kept, cameras, strict=True)
         if (pose := views[index]) is not None
     ]
-    return Capture(tuple(frames), np.zeros((0, 3)), (), rows[kept, 15:].copy(), "llff", notes=notes)
+    return Capture(tuple(frames), depth_bounds=rows[kept, 15:].copy(), kind="llff", notes=notes)
 
 
 def losses_llff(capture: Capture) -> tuple[str, ...]:

@@ -24,7 +24,16 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import check_unique_names, malformed, name_of, numbers, read_xml, shown, size_of
+from nerfcli.captures.formats.fields import (
+    check_unique_names,
+    malformed,
+    matrix_of,
+    name_of,
+    numbers,
+    read_xml,
+    shown,
+    size_of,
+)
 from nerfcli.captures.formats.format import Format, by_suffix
 from nerfcli.captures.formats.lens_fits import Fits, Terms
 from nerfcli.captures.formats.lenses import spherical_camera
@@ -85,7 +94,7 @@ def parse_metashape(path: Path) -> Capture:
         if sensor not in cameras:
             cameras[sensor] = _camera(sensors[sensor], f"{path}: sensor {shown(sensor)}", fits)
         place = f"{where}: transform"
-        chunk_from_cam = poses.read(name, place, partial(_matrix, record, place))
+        chunk_from_cam = poses.read(name, place, partial(matrix_of, _words(record, "transform"), 4, 4, place))
         if chunk_from_cam is None:
             continue
         world_from_chunk = worlds.get(record.get("component_id"))
@@ -93,7 +102,7 @@ def parse_metashape(path: Path) -> Capture:
         frames.append(Frame(name, cameras[sensor], world_from_cam))
     notes = (*notes, *poses.notes(), *fits.notes())
     check_unique_names((frame.name for frame in frames), path)
-    return Capture(tuple(frames), np.zeros((0, 3)), kind="metashape", notes=notes)
+    return Capture(tuple(frames), kind="metashape", notes=notes)
 
 
 def _unusable(camera: Element, sensors: Mapping[str | None, Element]) -> str:
@@ -110,10 +119,6 @@ def _unusable(camera: Element, sensors: Mapping[str | None, Element]) -> str:
 def _left_out(reason: str, reasons: Mapping[Element, str]) -> str:
     names = [camera.get("label") or f"id {camera.get('id')}" for camera, why in reasons.items() if why == reason]
     return f"{len(names)} of {several(len(reasons), 'camera')} left out, {reason}: {in_words(names)}"
-
-
-def _matrix(record: Element, where: str) -> np.ndarray:
-    return np.array(numbers(_words(record, "transform"), 16, where)).reshape(4, 4)
 
 
 def _chunk(path: Path) -> Element:
@@ -144,7 +149,7 @@ def _similarity(record: Element | None, where: str) -> rigid.Similarity | None:
     where = f"{where}: transform"
     rotation = np.eye(3)
     if record.find("rotation") is not None:
-        rotation = np.array(numbers(_words(record, "rotation"), 9, f"{where}: rotation")).reshape(3, 3)
+        rotation = matrix_of(_words(record, "rotation"), 3, 3, f"{where}: rotation")
     translation = np.zeros(3)
     if record.find("translation") is not None:
         translation = np.array(numbers(_words(record, "translation"), 3, f"{where}: translation"))

@@ -18,12 +18,12 @@ import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import check_unique_names, malformed, numbers, read_text
+from nerfcli.captures.formats.fields import check_unique_names, malformed, matrix_of, numbers, read_text
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.lens_fits import Fits
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
-from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.captures.orientation import stored_size
 from nerfcli.captures.stored_pixels import measure
 
 CAMERA_FOLDER = "cams"
@@ -33,7 +33,7 @@ IMAGE_FOLDERS = ("images", "blended_images")
 _EXPECTED = "expected the word extrinsic, 16 numbers, the word intrinsic, 9 numbers, and a line of 2 to 4 depths"
 
 
-def parse_mvsnet(folder: Path, measure: Measure, *, images: Path | None = None) -> Capture:
+def parse_mvsnet(folder: Path, *, images: Path | None = None) -> Capture:
     """Read the cameras in cams/, with their depth bounds where all files have them.
 
     The photos are in `images`, by default images/ or blended_images/.
@@ -49,8 +49,8 @@ def parse_mvsnet(folder: Path, measure: Measure, *, images: Path | None = None) 
     for file, stem, image in zip(files, stems, photos.paths, strict=True):
         fields = _fields(file)
         place = f"{file}: extrinsic"
-        pose = poses.read_inverse(stem, place, partial(_matrix, fields[1:17], 4, place))
-        matrix = _matrix(fields[18:27], 3, f"{file}: intrinsic")
+        pose = poses.read_inverse(stem, place, partial(matrix_of, fields[1:17], 4, 4, place))
+        matrix = matrix_of(fields[18:27], 3, 3, f"{file}: intrinsic")
         depths = numbers(fields[27:], len(fields) - 27, f"{file}: depths")
         if image is not None and pose is not None:
             camera = fits.matrix(matrix, stored_size(image, measure), f"{file}: intrinsic")
@@ -59,7 +59,7 @@ def parse_mvsnet(folder: Path, measure: Measure, *, images: Path | None = None) 
     notes = (*photos.notes, *poses.notes(), *fits.notes())
     check_unique_names((frame.name for frame in frames), folder)
     known = np.array(bounds) if None not in bounds else None
-    return Capture(tuple(frames), np.zeros((0, 3)), photos.missing, known, "mvsnet", notes=notes)
+    return Capture(tuple(frames), missing=photos.missing, depth_bounds=known, kind="mvsnet", notes=notes)
 
 
 def _fields(file: Path) -> list[str]:
@@ -68,10 +68,6 @@ def _fields(file: Path) -> list[str]:
     if len(fields) < 27 or fields[0] != "extrinsic" or fields[17] != "intrinsic" or len(fields) > 31:
         raise malformed(str(file), "is not a camera of MVSNet", _EXPECTED)
     return fields
-
-
-def _matrix(words: list[str], side: int, where: str) -> np.ndarray:
-    return np.array(numbers(words, side * side, where)).reshape(side, side)
 
 
 def _bounds(depths: list[float]) -> tuple[float, float] | None:
@@ -92,5 +88,5 @@ FORMAT = Format(
     "cams/ of MVSNet, BlendedMVS",
     "cams/",
     find_mvsnet,
-    lambda path, given: parse_mvsnet(path, measure, images=given.images),
+    lambda path, given: parse_mvsnet(path, images=given.images),
 )

@@ -22,7 +22,7 @@ from nerfcli.captures.formats.lens_fits import Fits
 from nerfcli.captures.formats.limits import plausible
 from nerfcli.captures.formats.npy import DAMAGED, array_of_npy, members_of_npz
 from nerfcli.captures.formats.photo_names import GIVE_PHOTOS
-from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.captures.orientation import stored_size
 from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import UserError
 from nerfcli.photos.images import list_images
@@ -38,7 +38,7 @@ _SINGULAR = 1e-9
 _ROUNDING_PX = 0.01
 
 
-def parse_neus(path: Path, measure: Measure, *, images: Path | None = None) -> Capture:
+def parse_neus(path: Path, *, images: Path | None = None) -> Capture:
     """Read the cameras of the file, in its world; the photos are those beside it, in order.
 
     Args:
@@ -67,7 +67,7 @@ def parse_neus(path: Path, measure: Measure, *, images: Path | None = None) -> C
         camera = fits.matrix(matrix, stored_size(image, measure), f"{path}: {names[index]}")
         mask = masks[index] if len(masks) == count else None
         frames.append(Frame(image.name, camera, views[index][1], image=image, mask=mask))
-    return Capture(tuple(frames), np.zeros((0, 3)), kind="neus", notes=fits.notes())
+    return Capture(tuple(frames), kind="neus", notes=fits.notes())
 
 
 def _without_rounding(matrices: np.ndarray) -> np.ndarray:
@@ -128,5 +128,5 @@ FORMAT = Format(
     "projections of IDR, NeuS",
     ".npz",
     find_neus,
-    lambda path, given: parse_neus(path, measure, images=given.images),
+    lambda path, given: parse_neus(path, images=given.images),
 )

@@ -64,16 +64,9 @@ def parse_polycam(folder: Path, *, images: Path | None = None) -> Capture:
     whole = len(list((folder / KEYFRAMES / "cameras").glob("*.json")))
     left = (f"{whole - len(stems)} of {whole} keyframes left out, whose poses Polycam has not corrected",)
     notes = (*photos.notes, *poses.notes(), *(left if whole > len(stems) else ()))
+    source = "LiDAR (Polycam)"
     check_unique_names((frame.name for frame in frames), folder)
-    return Capture(
-        tuple(frames),
-        np.zeros((0, 3)),
-        photos.missing,
-        kind="polycam",
-        unit="metre",
-        unit_source="LiDAR (Polycam)",
-        notes=notes,
-    )
+    return Capture(tuple(frames), missing=photos.missing, kind="polycam", unit="metre", unit_source=source, notes=notes)
 
 
 def _uncorrected(file: Path) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.lens_fits import Fits
 from nerfcli.captures.formats.limits import FramePoses, checked_camera
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, FoundPhotos, find_photos
-from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.captures.orientation import stored_size
 from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import UserError
 
@@ -66,7 +66,6 @@ def is_pose(path: Path) -> bool:
 
 def parse_pose_files(
     folder: Path,
-    measure: Measure,
     *,
     camera: Camera | None = None,
     images: Path | None = None,
@@ -100,14 +99,7 @@ def parse_pose_files(
             frames.append(Frame(image.name, own_camera, world_from_cam, image=image, split=split, depth=depth))
     notes = (*photos.notes, *poses.notes(), *fits.notes())
     check_unique_names((frame.name for frame in frames), folder)
-    return Capture(
-        tuple(frames),
-        np.zeros((0, 3)),
-        photos.missing,
-        None,
-        "pose-files",
-        notes=notes,
-    )
+    return Capture(tuple(frames), missing=photos.missing, kind="pose-files", notes=notes)
 
 
 def _photos(stems: list[str], homes: tuple[Path, ...], images: Path | None) -> FoundPhotos:
@@ -167,5 +159,5 @@ FORMAT = Format(
     "a matrix per photo, as in ScanNet, 7-Scenes, NSVF",
     "pose/*.txt",
     find_pose_files,
-    lambda path, given: parse_pose_files(path, measure, camera=given.camera, images=given.images),
+    lambda path, given: parse_pose_files(path, camera=given.camera, images=given.images),
 )

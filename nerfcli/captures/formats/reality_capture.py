@@ -72,7 +72,7 @@ def parse_reality_capture(path: Path, measure: Measure, *, images: Path | None =
             camera = camera_of_values(intrinsics, stored_size(image, measure), places[index], fits)
             frames.append(Frame(name, camera, poses[index], image=image))
     notes = (*found.notes, *lost, *fits.notes())
-    return Capture(tuple(frames), np.zeros((0, 3)), found.missing, kind="reality_capture", notes=notes)
+    return Capture(tuple(frames), missing=found.missing, kind="reality_capture", notes=notes)
 
 
 def _table(path: Path) -> tuple[list[str], np.ndarray, list[str], tuple[str, ...]]:

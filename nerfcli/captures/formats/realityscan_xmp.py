@@ -17,13 +17,13 @@ import numpy as np
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import malformed, numbers, read_xml, shown
+from nerfcli.captures.formats.fields import malformed, matrix_of, numbers, read_xml, shown
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.lens_fits import Fits
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.formats.reality_capture import camera_of_values
-from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.captures.orientation import stored_size
 from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import listed, several
 
@@ -34,7 +34,7 @@ _MODELS = ("perspective", "brown3", "brown3t2", "brown4", "brown4t2")
 _TERMS = ("k1", "k2", "k3", "k4", "t1", "t2")
 
 
-def parse_realityscan_xmp(folder: Path, measure: Measure, *, images: Path | None = None) -> Capture:
+def parse_realityscan_xmp(folder: Path, *, images: Path | None = None) -> Capture:
     """Read the cameras of the photos in a folder, in the coordinates that they were exported in; the unit is arbitrary.
 
     Files of other programs, or with intrinsics only, and those with coordinates relative to a camera rig give no frame.
@@ -68,7 +68,7 @@ def parse_realityscan_xmp(folder: Path, measure: Measure, *, images: Path | None
     if without:
         names = listed([path.name for path, _ in without])
         notes.append(f"{several(len(without), 'XMP file')} without a pose in the scene left out: {names}")
-    return Capture(tuple(frames), np.zeros((0, 3)), found.missing, kind="realityscan-xmp", notes=tuple(notes))
+    return Capture(tuple(frames), missing=found.missing, kind="realityscan-xmp", notes=tuple(notes))
 
 
 def _values(path: Path) -> dict[str, str]:
@@ -90,7 +90,7 @@ def _values(path: Path) -> dict[str, str]:
 
 
 def _pose(value: dict[str, str], where: str) -> np.ndarray:
-    rotation = np.array(numbers(value["Rotation"].split(), 9, f"{where}: Rotation")).reshape(3, 3)
+    rotation = matrix_of(value["Rotation"].split(), 3, 3, f"{where}: Rotation")
     position = np.array(numbers(value["Position"].split(), 3, f"{where}: Position"))
     return np.column_stack([rotation.T, position])
 
@@ -139,5 +139,5 @@ FORMAT = Format(
     "RealityScan, RealityCapture",
     ".xmp",
     find_realityscan_xmp,
-    lambda path, given: parse_realityscan_xmp(path, measure, images=given.images),
+    lambda path, given: parse_realityscan_xmp(path, images=given.images),
 )

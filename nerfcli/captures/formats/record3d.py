@@ -55,28 +55,17 @@ def parse_record3d(path: Path, *, images: Path | None = None) -> Capture:
     intrinsics = _intrinsics(content, len(poses), where).tolist()
     for index, (pose, image) in enumerate(zip(poses, photos.paths, strict=True)):
         place = f"{where}: {_POSES}[{index}]"
-        world_from_cam = usable.read_quaternion(str(index), place, partial(_parts, pose, place))
+        world_from_cam = usable.read_quaternion(str(index), place, partial(vector, {"pose": pose}, "pose", 7, place))
         if image is not None and world_from_cam is not None:
             camera = checked_camera("PINHOLE", *size, tuple(intrinsics[index]), where=where)
             pose = opencv_from_opengl_pose(world_from_cam)
             maps = (path.parent / "depth" / f"{index}.exr", image.with_suffix(".exr"), image.with_suffix(".depth"))
             depth = SensorDepth.found(*maps, confidence=image.with_suffix(".conf"))
             frames.append(Frame(image.name, camera, pose, image=image, depth=depth))
+    notes, source = (*photos.notes, *usable.notes()), "ARKit (Record3D)"
     return Capture(
-        tuple(frames),
-        np.zeros((0, 3)),
-        photos.missing,
-        kind="record3d",
-        unit="metre",
-        unit_source="ARKit (Record3D)",
-        notes=(*photos.notes, *usable.notes()),
+        tuple(frames), missing=photos.missing, kind="record3d", unit="metre", unit_source=source, notes=notes
     )
-
-
-def _parts(pose: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the quaternion xyzw and the position of a pose."""
-    row = vector({"pose": pose}, "pose", 7, where)
-    return row[:4], row[4:]
 
 
 def _intrinsics(content: dict[str, Any], count: int, where: str) -> np.ndarray:

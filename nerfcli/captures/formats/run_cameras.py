@@ -79,7 +79,7 @@ def parse_run(path: Path) -> Capture:
     cameras = _read_frames(path, given=False)
     splits = (("train", cameras.train), ("test", cameras.test))
     frames = tuple(replace(frame, split=split) for split, frames in splits for frame in frames)
-    return Capture(frames, np.zeros((0, 3)), (), None, "run", pixels="upright")
+    return Capture(frames, kind="run", pixels="upright")
 
 
 def _read_frames(path: Path, *, given: bool) -> RunCameras:

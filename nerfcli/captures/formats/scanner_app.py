@@ -22,7 +22,7 @@ from nerfcli.captures.formats.format import Format, has_keys
 from nerfcli.captures.formats.lens_fits import Fits
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
-from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.captures.orientation import stored_size
 from nerfcli.captures.stored_pixels import measure
 
 _POSE = "cameraPoseARFrame"
@@ -35,7 +35,7 @@ def frame_files(folder: Path) -> list[Path]:
     return sorted(files, key=lambda path: (len(path.name), path.name))
 
 
-def parse_scanner_app(folder: Path, measure: Measure, *, images: Path | None = None) -> Capture:
+def parse_scanner_app(folder: Path, *, images: Path | None = None) -> Capture:
     """Read the frames that have a photo; the unit is the metre, by ARKit.
 
     Args:
@@ -63,9 +63,7 @@ def parse_scanner_app(folder: Path, measure: Measure, *, images: Path | None = N
     if found.missing:
         notes += (f"{len(frames)} of the {len(files)} frames with a pose have a photo",)
     source = "ARKit (3D Scanner App)"
-    return Capture(
-        tuple(frames), np.zeros((0, 3)), kind="3d-scanner-app", unit="metre", unit_source=source, notes=notes
-    )
+    return Capture(tuple(frames), kind="3d-scanner-app", unit="metre", unit_source=source, notes=notes)
 
 
 def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
@@ -87,6 +85,6 @@ FORMAT = Format(
     "3D Scanner App",
     "frame_00000.json",
     find_scanner_app,
-    lambda path, given: parse_scanner_app(path, measure, images=given.images),
+    lambda path, given: parse_scanner_app(path, images=given.images),
     axes="opengl",
 )

@@ -10,14 +10,11 @@ Source: scannetpp/scannetpp common/utils/nerfstudio.py, common/scene_release.py;
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, malformed, read_json_object
 from nerfcli.captures.formats.format import Format, has_keys
 from nerfcli.captures.formats.photo_search import plain_name
 from nerfcli.captures.formats.transforms import listed_frames, records_of
-from nerfcli.captures.orientation import Measure
 from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import several
 
@@ -27,7 +24,7 @@ _HELD_OUT = "test_frames"
 _SPLITS = {"frames": "train", _HELD_OUT: "test"}
 
 
-def parse_scannetpp(path: Path, measure: Measure, *, images: Path | None = None) -> Capture:
+def parse_scannetpp(path: Path, *, images: Path | None = None) -> Capture:
     """Read the photos of both lists that are not marked as bad, with their masks where these are on disk.
 
     Args:
@@ -55,10 +52,8 @@ def parse_scannetpp(path: Path, measure: Measure, *, images: Path | None = None)
         frames = [replace(frame, split=split) for frame, split in zip(frames, splits, strict=True)]
     if len(good) < len(both):
         notes += (f"{several(len(both) - len(good), 'photo')} marked as bad left out",)
-    points, source = np.zeros((0, 3)), "laser scan (ScanNet++)"
-    return Capture(
-        tuple(frames), points, tuple(missing), kind="scannetpp", unit="metre", unit_source=source, notes=notes
-    )
+    source, lost = "laser scan (ScanNet++)", tuple(missing)
+    return Capture(tuple(frames), missing=lost, kind="scannetpp", unit="metre", unit_source=source, notes=notes)
 
 
 def find_scannetpp(path: Path) -> Path | None:
@@ -76,6 +71,6 @@ FORMAT = Format(
     "ScanNet++",
     "dslr/nerfstudio/transforms.json",
     find_scannetpp,
-    lambda path, given: parse_scannetpp(path, measure, images=given.images),
+    lambda path, given: parse_scannetpp(path, images=given.images),
     axes="opengl",
 )

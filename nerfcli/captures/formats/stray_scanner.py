@@ -20,7 +20,7 @@ from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.lens_fits import Fits
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import GIVE_PHOTOS, FoundPhotos, find_photos
-from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.captures.orientation import stored_size
 from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import several
 from nerfcli.photos.video import open_video
@@ -34,7 +34,7 @@ _LENS = ("fx", "fy", "cx", "cy")
 _EXPECTED = "expected the table of Stray Scanner: timestamp, frame, x, y, z, qx, qy, qz, qw"
 
 
-def parse_stray_scanner(folder: Path, measure: Measure, *, images: Path | None = None) -> Capture:
+def parse_stray_scanner(folder: Path, *, images: Path | None = None) -> Capture:
     """Read the frames whose photo is on disk, or all frames if none is; the unit is the metre, by ARKit.
 
     Args:
@@ -57,7 +57,7 @@ def parse_stray_scanner(folder: Path, measure: Measure, *, images: Path | None =
         if has_lenses:
             fx, fy, cx, cy = numbers([row[key] for key in _LENS], 4, where)
             matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        pose = poses.read_quaternion(name, where, partial(_parts, row, where))
+        pose = poses.read_quaternion(name, where, partial(numbers, [row[key] for key in _POSE], len(_POSE), where))
         if pose is None:
             continue
         camera = fits.matrix(matrix, size, where if has_lenses else str(folder / MATRIX))
@@ -68,20 +68,8 @@ def parse_stray_scanner(folder: Path, measure: Measure, *, images: Path | None =
     notes = (*found.notes, *poses.notes(), *fits.notes())
     if there and len(there) < len(rows):
         notes += (f"{len(there)} of the {len(rows)} frames with a pose have a photo",)
-    return Capture(
-        tuple(frames),
-        np.zeros((0, 3)),
-        kind="stray-scanner",
-        unit="metre",
-        unit_source="ARKit (Stray Scanner)",
-        notes=notes,
-    )
-
-
-def _parts(row: dict[str, str], where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the quaternion xyzw and the position of a pose."""
-    values = np.array(numbers([row[key] for key in _POSE], len(_POSE), where))
-    return values[:4], values[4:]
+    source = "ARKit (Stray Scanner)"
+    return Capture(tuple(frames), kind="stray-scanner", unit="metre", unit_source=source, notes=notes)
 
 
 def _matrix(path: Path) -> np.ndarray:
@@ -141,6 +129,6 @@ FORMAT = Format(
     "Stray Scanner",
     ODOMETRY,
     find_stray_scanner,
-    lambda path, given: parse_stray_scanner(path, measure, images=given.images),
+    lambda path, given: parse_stray_scanner(path, images=given.images),
     video=video_of,
 )

@@ -21,6 +21,7 @@ from nerfcli.captures.formats.fields import (
     Row,
     check_unique_names,
     malformed,
+    matrix_of,
     numbers,
     opened,
     read_rows,
@@ -106,7 +107,7 @@ def _capture(path: Path, camera: Camera | None, read: Callable[[Path], Poses], *
     poses, notes = read(path)
     check_unique_names((name for name, _ in poses), path)
     frames = tuple(Frame(name, camera, world_from_cam) for name, world_from_cam in poses)
-    return Capture(frames, np.zeros((0, 3)), kind=kind, notes=notes)
+    return Capture(frames, kind=kind, notes=notes)
 
 
 def timed_rows(path: Path, expected: str) -> list[Row]:
@@ -126,25 +127,16 @@ def tum_poses(path: Path) -> Poses:
             raise malformed(where, f"has {len(cells)} numbers", "expected 8")
         if not _NUMBER.fullmatch(cells[0]):
             raise malformed(where, f"its timestamp is {shown(cells[0])}", "expected seconds, such as 1305031102.1753")
-        poses.append((cells[0], usable.read_quaternion(cells[0], where, partial(_tum_parts, cells[1:], where))))
+        read = partial(numbers, [*cells[4:], *cells[1:4]], 7, where)
+        poses.append((cells[0], usable.read_quaternion(cells[0], where, read)))
     return _usable(poses, usable, path, _TUM_EXPECTED)
-
-
-def _tum_parts(words: list[str], where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the quaternion xyzw and the position of a pose."""
-    values = np.array(numbers(words, 7, where))
-    return values[3:], values[:3]
 
 
 def _kitti_poses(path: Path) -> Poses:
     usable, poses = FramePoses(), []
     for index, (cells, where) in enumerate(read_rows(path, _KITTI_EXPECTED)):
-        poses.append((_indexed(index), usable.read(_indexed(index), where, partial(_kitti_matrix, cells, where))))
+        poses.append((_indexed(index), usable.read(_indexed(index), where, partial(matrix_of, cells, 3, 4, where))))
     return _usable(poses, usable, path, _KITTI_EXPECTED)
-
-
-def _kitti_matrix(words: list[str], where: str) -> np.ndarray:
-    return np.array(numbers(words, 12, where)).reshape(3, 4)
 
 
 def _usable(poses: list[tuple[str, np.ndarray | None]], usable: FramePoses, path: Path, expected: str) -> Poses:

@@ -22,7 +22,7 @@ from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, find_photos
 from nerfcli.captures.formats.timed_poses import MOST_AWAY_SECONDS, photos_at
 from nerfcli.captures.formats.trajectories import timed_rows, tum_poses
-from nerfcli.captures.orientation import Measure, stored_size
+from nerfcli.captures.orientation import stored_size
 from nerfcli.captures.stored_pixels import measure
 from nerfcli.errors import UserError
 
@@ -40,9 +40,7 @@ _KINECT_SIZE = (640, 480)
 _CALIBRATIONS = ("calibration.txt", "calib.txt")
 
 
-def parse_tum_rgbd(
-    folder: Path, measure: Measure, *, camera: Camera | None = None, images: Path | None = None
-) -> Capture:
+def parse_tum_rgbd(folder: Path, *, camera: Camera | None = None, images: Path | None = None) -> Capture:
     """Read the photos whose time is within that of the poses; poses are interpolated to it.
 
     Args:
@@ -68,7 +66,7 @@ def parse_tum_rgbd(
         for index, pose, name, place in zip(kept, interpolated, found.names, found.places, strict=True)
     )
     source, notes = "motion capture (TUM RGB-D)", (*found.notes, *lost, *unposed)
-    return Capture(frames, np.zeros((0, 3)), kind="tum-rgbd", unit="metre", unit_source=source, notes=notes)
+    return Capture(frames, kind="tum-rgbd", unit="metre", unit_source=source, notes=notes)
 
 
 def _files_in_time(path: Path) -> tuple[list[float], list[str]]:
@@ -119,7 +117,7 @@ FORMAT = Format(
     "a sequence of TUM RGB-D",
     "rgb.txt",
     find_tum_rgbd,
-    lambda path, given: parse_tum_rgbd(path, measure, camera=given.camera, images=given.images),
+    lambda path, given: parse_tum_rgbd(path, camera=given.camera, images=given.images),
     open_axes=True,
     open_centre=True,
 )
