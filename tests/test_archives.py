@@ -91,6 +91,24 @@ def test_another_archive_of_this_name_replaces_the_files_only_if_it_may(tmp_path
         unpack(path, tmp_path / "scene", overwrite=True)
 
 
+def test_separators_of_windows_are_read(tmp_path):
+    path = tmp_path / "scan.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(entry("scan\\images\\a.txt"), "good")
+    folder = unpack(path, tmp_path / "scene")
+    assert (folder / "a.txt").read_text() == "good"
+    assert folder == tmp_path / "scan-unpacked/scan/images"
+
+
+def test_an_archive_in_an_archive_is_named(tmp_path):
+    path = tmp_path / "outer.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(entry("scan/inner.zip"), "")
+    with pytest.raises(UserError, match=r"outer\.zip contains only archives, such as scan/inner\.zip"):
+        unpack(path, tmp_path / "scene")
+    assert not (tmp_path / "outer-unpacked").exists()
+
+
 @pytest.mark.parametrize(
     "name", ["../out.txt", "a/../../out.txt", "/tmp/out.txt", "C:/out.txt", "..\\out.txt", "a\nb.txt", "\\\\host\\out"]
 )

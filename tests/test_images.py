@@ -364,6 +364,14 @@ def test_the_largest_page_of_a_tiff_is_read(tmp_path, sizes):
     assert read_exif(path).pages == len(sizes)
 
 
+def test_float_pixels_on_a_later_page_are_no_damage(tmp_path):
+    pages = [np.zeros((4, 4, 3), np.uint8), np.full((8, 8, 3), 0.5, np.float32)]
+    cv2.imwritemulti(str(tmp_path / "merge.tif"), pages)
+    for read in (image_size, read_image):
+        with pytest.raises(UserError, match=r"merge\.tif has float pixels, whose white level is unknown"):
+            read(tmp_path / "merge.tif")
+
+
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 def test_float_pixels_are_named_as_the_reason(tmp_path, channels, kind):

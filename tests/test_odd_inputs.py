@@ -9,6 +9,7 @@ import shutil
 import struct
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -192,7 +193,10 @@ CAMERA = Camera("PINHOLE", 64, 48, (70.0, 70.0, 32.0, 24.0))
 POSES = np.array([frame.world_from_cam for frame in ring(CAMERA, num_frames=8).frames])
 LOST = 2
 # Formats whose files hold matrices, and are written number by number.
-OF_MATRICES = ("metashape", "bundler", "polycam", "mvsnet", "pose-files", "alicevision")
+OF_MATRICES = (
+    *("metashape", "bundler", "polycam", "mvsnet", "pose-files", "alicevision", "openmvg", "nerfies"),
+    "3d-scanner-app",
+)
 
 
 def put(form: str, folder: Path, poses: np.ndarray = POSES) -> Path:
@@ -262,7 +266,18 @@ def lose_reality_capture(folder: Path) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
+def lose_row(file: str, folder: Path) -> None:
+    """Make the numbers of the third row of a table unknown, but for those that say which photo it is."""
+    lines = (folder / file).read_text().splitlines()
+    row = next(index for index, line in enumerate(lines) if not line.startswith(("#", "timestamp"))) + LOST
+    cells = lines[row].split(",")
+    lines[row] = ", ".join([*cells[:2], *["nan"] * len(cells[2:])])
+    (folder / file).write_text("\n".join(lines) + "\n")
+
+
 LOSE = {
+    "kapture": partial(lose_row, "sensors/trajectories.txt"),
+    "stray-scanner": partial(lose_row, "odometry.csv"),
     "record3d": lose_record3d,
     "transforms": lose_transforms,
     "opensfm": lose_opensfm,

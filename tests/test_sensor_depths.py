@@ -290,19 +290,22 @@ def test_what_was_not_measured_has_no_depth(tmp_path):
     assert np.argwhere(np.isnan(z)).tolist() == [[5, 5], [10, 10]]
 
 
-def test_a_map_turns_like_its_photo_unless_it_is_upright(tmp_path):
-    """EXIF 6 turns the stored picture a quarter clockwise; a map of the stored shape goes with it."""
+@pytest.mark.parametrize(
+    ("orientation", "turned"), [(5, Z.T), (6, np.rot90(Z, -1)), (7, Z[::-1, ::-1].T), (8, np.rot90(Z))]
+)
+def test_a_map_turns_like_its_photo_unless_it_is_upright(tmp_path, orientation, turned):
+    """EXIF 6 turns the stored picture a quarter clockwise, 5 mirrors it; a map of the stored shape goes with it."""
     exif = Image.Exif()
-    exif[0x0112] = 6
+    exif[0x0112] = orientation
     Image.new("RGB", (300, 200)).save(tmp_path / "photo.jpg", exif=exif)
     np.save(tmp_path / "stored.npy", Z)
-    np.save(tmp_path / "upright.npy", np.rot90(Z, -1))
-    turned, upright = (
+    np.save(tmp_path / "upright.npy", turned)
+    stored, upright = (
         read_sensor_depth(SensorDepth(tmp_path / f"{name}.npy"), tmp_path / "photo.jpg").z
         for name in ("stored", "upright")
     )
-    assert turned.shape == (30, 20)
-    assert np.array_equal(turned, upright, equal_nan=True)
+    assert stored.shape == (30, 20)
+    assert np.array_equal(stored, upright, equal_nan=True)
 
 
 @pytest.mark.parametrize(

@@ -64,22 +64,18 @@ def parse_openmvg(path: Path, *, images: Path | None = None) -> Capture:
     """
     content = read_json_object(path)
     cameras = _cameras(content, path)
-    usable = FramePoses()
-    poses = {
-        key: usable.read(f"pose {key}", f"{where}: rotation", partial(_matrix, value, where))
-        for key, value, where in _entries(content, "extrinsics", path)
-    }
-    frames, frame_of, unposed = [], dict[int, int](), []
+    poses = {key: (value, where) for key, value, where in _entries(content, "extrinsics", path)}
+    usable, frames, frame_of, unposed = FramePoses(), [], dict[int, int](), []
     for key, value, where in _entries(content, "views", path):
         view = _data(value, where)
         parts = (view.get("local_path") or "", view.get("filename"))
         name = "/".join(name_of(part, where).strip("/") for part in parts if part != "")
-        pose, camera = poses.get(view.get("id_pose")), cameras.get(view.get("id_intrinsic"))
-        if pose is None or camera is None:
+        record, camera = poses.get(view.get("id_pose")), cameras.get(view.get("id_intrinsic"))
+        if record is None or camera is None:
             unposed.append(name)
-            continue
-        frame_of[key] = len(frames)
-        frames.append(Frame(name, camera, pose, image=path.parent / name))
+        elif (pose := usable.read(name, f"{record[1]}: rotation", partial(_matrix, *record))) is not None:
+            frame_of[key] = len(frames)
+            frames.append(Frame(name, camera, pose, image=path.parent / name))
     check_unique_names((frame.name for frame in frames), path)
     points, observations = _structure(content, frame_of, path)
     notes = (*usable.notes(), *without(unposed, "a pose"))
