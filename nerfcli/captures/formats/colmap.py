@@ -269,14 +269,10 @@ BINARY = Format(
 )
 
 
-TEXT = Format(
-    "colmap-text",
-    "a COLMAP model as text",
-    "sparse/0/cameras.bin or .txt",
-    find_model,
-    lambda path, given: parse_model(path, images=given.images),
-    files=MODEL_FILES,
-    is_unordered=True,  # ids of a model are in no particular order
+TEXT = replace(
+    BINARY,
+    name="colmap-text",
+    of="a COLMAP model as text",
     write=write_colmap_text,
     losses=losses_colmap_text,
 )

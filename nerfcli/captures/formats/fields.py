@@ -215,7 +215,7 @@ def matrix(record: dict[str, Any], key: str, rows: tuple[int, ...], columns: int
         UserError: the key is absent, or its value is not such a list; a `NotFiniteError` if a number is not known.
     """
     value = record.get(key)
-    if isinstance(value, list) and len(value) in rows:
+    if isinstance(value, list) and len(value) in rows and all(len(r) == columns for r in value if isinstance(r, list)):
         return np.stack([vector({key: row}, key, columns, where) for row in value])
     raise _no_value(record, key, where, f"expected {rows[-1]} rows of {columns} numbers")
 

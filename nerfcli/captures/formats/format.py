@@ -89,12 +89,12 @@ def by_suffix(suffix: str, *names: str) -> Callable[[Path], Path | None]:
     return lambda path: path if path.is_file() and path.suffix.lower() == suffix else in_folder(path)
 
 
-def folder_of(name: str) -> Callable[[Path], Path | None]:
-    """Return a finder of the folder that holds this file, given the folder or the file."""
+def folder_with(*names: str) -> Callable[[Path], Path | None]:
+    """Return a finder of the folder that holds all of these files, given the folder or one of them."""
 
     def find(path: Path) -> Path | None:
-        folder = path.parent if path.name == name else path
-        return folder if (folder / name).is_file() else None
+        folder = path.parent if path.is_file() and path.name in names else path
+        return folder if all((folder / name).is_file() for name in names) else None
 
     return find
 

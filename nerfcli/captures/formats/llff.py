@@ -18,7 +18,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.format import Format, folder_of
+from nerfcli.captures.formats.format import Format, folder_with
 from nerfcli.captures.formats.limits import FramePoses, checked_camera, plausible
 from nerfcli.captures.formats.npy import DAMAGED, array_of_npy
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
@@ -189,7 +189,7 @@ FORMAT = Format(
     "llff",
     "poses_bounds.npy",
     "poses_bounds.npy",
-    folder_of(FILE),
+    folder_with(FILE),
     lambda path, given: parse_llff(path, images=given.images),
     axes="llff",
     open_axes=True,

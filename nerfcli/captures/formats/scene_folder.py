@@ -17,7 +17,7 @@ from nerfcli.cameras.frame import Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import parse_colmap, read_model, write_colmap_binary
 from nerfcli.captures.formats.fields import read_json_object
-from nerfcli.captures.formats.format import Format, folder_of
+from nerfcli.captures.formats.format import Format, folder_with
 from nerfcli.captures.formats.photo_names import seen_from, with_photos
 from nerfcli.captures.holdout import default_split
 from nerfcli.captures.stored_pixels import UPRIGHT
@@ -353,7 +353,7 @@ FORMAT = Format(
     "nerfcli",
     "a scene folder",
     SCENE_FILE,
-    folder_of(SCENE_FILE),
+    folder_with(SCENE_FILE),
     lambda path, given: parse_scene(path, images=given.images),
     files=SCENE_FILES,
     is_unordered=True,

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth, Size
+from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, malformed, numbers, read_rows
-from nerfcli.captures.formats.format import Format
+from nerfcli.captures.formats.format import Format, folder_with
 from nerfcli.captures.formats.lens_fits import Fits
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import GIVE_PHOTOS, FoundPhotos, find_photos
@@ -47,7 +47,15 @@ def parse_stray_scanner(folder: Path, *, images: Path | None = None) -> Capture:
     rows = _rows(path)
     found = _photos(list(rows), folder, images)
     there = [image for image in found.paths if image is not None]
-    size = stored_size(there[0], measure) if there else _size_of_video(folder)
+    if there:
+        size = stored_size(there[0], measure)
+    elif (path_of_video := video_of(folder)) is not None:
+        video = open_video(path_of_video)
+        size = video.width, video.height
+    else:
+        raise malformed(
+            str(folder), f"has neither photos nor the video {_VIDEOS[0]}", f"copy the whole capture; {GIVE_PHOTOS}"
+        )
     has_lenses = all(key in row for row, _ in rows.values() for key in _LENS)
     matrix = np.eye(3) if has_lenses else _matrix(folder / MATRIX)
     fits, poses, frames = Fits(), FramePoses(), []
@@ -108,27 +116,11 @@ def video_of(folder: Path) -> Path | None:
     return next((folder / name for name in _VIDEOS if (folder / name).is_file()), None)
 
 
-def _size_of_video(folder: Path) -> Size:
-    video = video_of(folder)
-    if video is None:
-        raise malformed(
-            str(folder), f"has neither photos nor the video {_VIDEOS[0]}", f"copy the whole capture; {GIVE_PHOTOS}"
-        )
-    opened = open_video(video)
-    return opened.width, opened.height
-
-
-def find_stray_scanner(path: Path) -> Path | None:
-    """Find the folder of a capture, given it or its odometry.csv."""
-    folder = path.parent if path.name.lower() == ODOMETRY else path
-    return folder if all((folder / name).is_file() for name in (ODOMETRY, MATRIX)) else None
-
-
 FORMAT = Format(
     "stray-scanner",
     "Stray Scanner",
     ODOMETRY,
-    find_stray_scanner,
+    folder_with(ODOMETRY, MATRIX),
     lambda path, given: parse_stray_scanner(path, images=given.images),
     video=video_of,
 )

@@ -18,7 +18,7 @@ from nerfcli.cameras.frame import Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import check_unique_names, name_of, numbers, read_text
-from nerfcli.captures.formats.format import Format
+from nerfcli.captures.formats.format import Format, folder_with
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, find_photos
 from nerfcli.captures.formats.timed_poses import MOST_AWAY_SECONDS, photos_at
 from nerfcli.captures.formats.trajectories import timed_rows, tum_poses
@@ -106,17 +106,11 @@ def _own_camera(folder: Path, size: tuple[int, int]) -> Camera:
     return lenses.brown_camera(size, (fx, fy), (cx, cy), radial=(k1, k2, k3), tangential=(p1, p2), where=where)
 
 
-def find_tum_rgbd(path: Path) -> Path | None:
-    """Find the folder of a sequence, given it or its rgb.txt or groundtruth.txt."""
-    folder = path.parent if path.is_file() and path.name in (PHOTOS, TRUTH) else path
-    return folder if all((folder / name).is_file() for name in (PHOTOS, TRUTH)) else None
-
-
 FORMAT = Format(
     "tum-rgbd",
     "a sequence of TUM RGB-D",
     "rgb.txt",
-    find_tum_rgbd,
+    folder_with(PHOTOS, TRUTH),
     lambda path, given: parse_tum_rgbd(path, camera=given.camera, images=given.images),
     open_axes=True,
     open_centre=True,
