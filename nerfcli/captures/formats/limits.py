@@ -139,7 +139,9 @@ class FramePoses:
         scaled, scale = found
         return rigid.inverse(rigid_pose(np.column_stack([scaled[:3, :3], scaled[:3, 3] / scale]), where))
 
-    def read_quaternion(self, name: str, where: str, values: Callable[[], Sequence[float]]) -> np.ndarray | None:
+    def read_quaternion(
+        self, name: str, where: str, values: Callable[[], Sequence[float] | np.ndarray]
+    ) -> np.ndarray | None:
         """Return the pose (4, 4) of a frame from the quaternion xyzw and the position in the file; None if unusable."""
         self._count += 1
         try:
