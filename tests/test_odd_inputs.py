@@ -156,6 +156,11 @@ def test_a_folder_of_another_name_is_no_other_folder_of_the_same_photo(tmp_path)
     assert find(tmp_path, ["left/a.png"]).paths == (None,)
 
 
+def test_photos_in_full_size_come_before_reduced_ones_where_no_size_is_known(tmp_path):
+    photos(tmp_path, ["images_4/b.png", "input/b.png"])
+    assert find_photos(["b.png"], [tmp_path]).paths == (tmp_path / "input/b.png",)
+
+
 def test_a_photo_that_was_moved_to_a_subfolder_is_not_brought_back(tmp_path):
     photos(tmp_path / "images", ["a.png", "rejected/b.png"])
     assert levels(find(tmp_path, ["a.png", "b.png"]).paths) == [0, None]
