@@ -70,7 +70,8 @@ def parse_openmvg(path: Path, *, images: Path | None = None) -> Capture:
         view = _data(value, where)
         parts = (view.get("local_path") or "", view.get("filename"))
         name = "/".join(name_of(part, where).strip("/") for part in parts if part != "")
-        record, camera = poses.get(view.get("id_pose", -1)), cameras.get(view.get("id_intrinsic", -1))
+        ids = [value if isinstance(value := view.get(entry), int) else -1 for entry in ("id_pose", "id_intrinsic")]
+        record, camera = poses.get(ids[0]), cameras.get(ids[1])
         if record is None or camera is None:
             unposed.append(name)
         elif (pose := usable.read(name, f"{record[1]}: rotation", partial(_matrix, *record))) is not None:

@@ -55,5 +55,5 @@ def photos_at(
     poses, is_known = poses_at(np.array(times), world_from_body, np.array(seconds))
     if not is_known.any():
         raise malformed(where, "has no pose at the time of a photo", "copy the whole sequence")
-    unposed = [name for name, known in zip(names, is_known, strict=True) if not known]
+    unposed = [names[index] for index in np.flatnonzero(~is_known).tolist()]
     return np.flatnonzero(is_known).tolist(), poses[is_known], without(unposed, "a pose near in time")
