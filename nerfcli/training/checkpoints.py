@@ -35,7 +35,7 @@ from nerfcli.render.model import Model, load_model, save_model
 from nerfcli.render.tracing import render_rays
 from nerfcli.training.appearance import over_background
 from nerfcli.training.extent import Extent
-from nerfcli.training.fine_cells import with_fine_cells
+from nerfcli.training.fine_cells import FEWEST_STEPS, with_fine_cells
 from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.pool import PixelPool, load_album
 from nerfcli.training.preparation import EarlierDecisions
@@ -144,8 +144,8 @@ class Checkpoints:
         """Write the files after the last step, with what makes pictures of a hash grid faster."""
         if distributed.rank() == 0:
             model = self.model()
-            is_fast = isinstance(model.field, HashField)
-            self._write(with_fine_cells(model, self.frames()[0]) if is_fast else model)
+            has_surfaces = isinstance(model.field, HashField) and self._fitting.step >= FEWEST_STEPS
+            self._write(with_fine_cells(model, self.frames()[0]) if has_surfaces else model)
 
     def _write(self, model: Model) -> None:
         tensors, description = self._fitting.state()

@@ -18,6 +18,8 @@ from nerfcli.render.tracing import pixel_rays, render_rays
 from nerfcli.training.open_cells import training_points
 
 SIDE = 256
+# Steps after which a field has surfaces; before, it is fog, which leaves no cell empty.
+FEWEST_STEPS = 200
 # Rays of all photos together that mark the cells to examine, and the number at a time.
 NUM_RAYS, AT_A_TIME = 150_000, 2**14
 # Random points of a cell, one in each of 3 x 3 x 3 parts; with 8 instead of 27, pictures differ by 50 dB, not 67.
