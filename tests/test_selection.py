@@ -309,7 +309,7 @@ SEARCHES: dict[str, tuple[Gain, Components, tuple[str, str] | None]] = {
         Components(view=0, exposure="learned"),
         None,
     ),
-    "of two that mend the same fault the better one is kept": (
+    "the better of two components that fix the same fault is kept": (
         lambda c: 0.6 if c.exposure == "learned" else 0.5 * (c.background == "sphere"),
         Components(view=0, exposure="learned"),
         ("background", "no gain above the noise, in addition to exposure"),

@@ -56,14 +56,14 @@ def unpacked(path: Path, beside: Path, *, overwrite: bool, reporter: Reporter) -
     if not is_archive(path):
         return path
     folder = beside.absolute().parent / f"{path.stem}-unpacked"
-    with _opened(path) as archive, reporter.stage(f"unpack {path.name}") as told:
+    with _opened(path) as archive, reporter.stage(f"unpack {path.name}") as stage:
         members = _checked(path, archive.infolist())
         content = {"archive": path.name, "bytes": path.stat().st_size, "files": _digest(members)}
         if not _is_kept(folder, content, path, overwrite=overwrite):
-            _extract(archive, members, folder, content, told.progress)
-            told.note(f"{folder}: {several(len(members), 'file')} of {path.name}")
+            _extract(archive, members, folder, content, stage.progress)
+            stage.note(f"{folder}: {several(len(members), 'file')} of {path.name}")
         else:
-            told.note(f"{folder} is kept: it has the files of {path.name}")
+            stage.note(f"{folder} is kept: it has the files of {path.name}")
     return _innermost(folder)
 
 

@@ -157,9 +157,9 @@ def _plain_lines(title: str) -> Iterator[Callable[[float, str], None]]:
 
 
 class _Clock:
-    """The time left in a stage, by its speed since it first moved: what comes before, such as compiling, is no speed.
+    """Estimate of the time left in a stage, from its speed since the first progress.
 
-    A training that is resumed does not begin at 0.
+    Work before that, such as compiling, does not count. A training that is resumed does not begin at 0.
     """
 
     def __init__(self) -> None:

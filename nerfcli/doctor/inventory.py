@@ -28,7 +28,7 @@ def readable(unreadable: Mapping[str, str], photos: Sequence[PhotoFacts], skippe
     """Check whether all files can be read; `skipped` counts those that are no photos, as text."""
     bad, total = len(unreadable), len(unreadable) + len(photos)
     paged = [photo.name for photo in photos if photo.exif.pages > 1]
-    notes = f"; no photos: {skipped}" if skipped else ""
+    notes = f"; other files, not used: {skipped}" if skipped else ""
     notes += f"; the largest page is used of {several(len(paged), 'file')}, such as {paged[0]}" if paged else ""
     threshold = "look from 1, bad from 10 % of the photos"
     if not bad:

@@ -353,7 +353,7 @@ def list_unreadable(folder: Path, *, subfolders: bool = False) -> list[Path]:
 
 
 def skipped_files(folder: Path, *, subfolders: bool = False) -> str:
-    """Count the files that are no photos by their suffix, such as "2 .mov, 1 .txt"; "" without any.
+    """Count the other files by their suffix, such as "2 .mov, 1 .txt"; "" without any.
 
     Pictures in an unusual format beside the same photo in a usual one count, too.
     """

@@ -106,7 +106,7 @@ def _unpacked(path: Path, dtype: type, aspect: float) -> np.ndarray:
     try:
         liblzfse = importlib.import_module("liblzfse")
     except ImportError as error:
-        hint = 'install it with: pip install pyliblzfse; or export as "EXR + RGB" from Record3D'
+        hint = "install it with: pip install 'nerfcli[record3d]'; or export as \"EXR + RGB\" from Record3D"
         raise UserError(f"{path} is compressed with LZFSE, which needs pyliblzfse", hint) from error
     values = np.frombuffer(liblzfse.decompress(path.read_bytes()), dtype)
     return values.reshape(round(math.sqrt(len(values) / aspect)), -1)

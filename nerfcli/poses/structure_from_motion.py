@@ -131,7 +131,7 @@ def photo_notes(photos: Photos, grouped: PhotoGroups) -> list[str]:
     """List the skipped files with reasons, and notes on the pages and cameras of the other photos."""
     notes = [f"{name} is skipped: {why}" for name, why in photos.unreadable.items()]
     if photos.skipped:
-        notes.append(f"files that are no photos: {photos.skipped}")
+        notes.append(f"other files, not used: {photos.skipped}")
     paged = [photo for photo in photos.photos if photo.exif.pages > 1]
     if paged:
         first = f"{paged[0].name}, {paged[0].width}x{paged[0].height}"

@@ -101,9 +101,9 @@ class TrainedField:
         return self.occupied if self.fine is None else self.fine
 
     @cached_property
-    def distances(self) -> Tensor:
-        """The distances to open cells, for `kernels.March`."""
-        return distances_to_occupied(self.open_cells.cpu())
+    def distances(self) -> Tensor | None:
+        """The distances to open cells, for `kernels.March`; None on a GPU, whose kernels do not use them."""
+        return distances_to_occupied(self.open_cells) if self.device.type == "cpu" else None
 
     @property
     def contraction(self) -> str:

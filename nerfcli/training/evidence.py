@@ -144,24 +144,6 @@ def collect_evidence(
         settings: their components; with model="auto", what is open is not decided yet unless it is `fixed`.
         is_new: whether this training begins now, so that open components and focal lengths are decided.
     """
-    found = _of_photos(photos, pool, extent, settings=settings, is_new=is_new, notify=notify)
-    is_open = is_new and settings.model == "auto" and "sensor" not in settings.fixed and not pool.has_alpha
-    can_match = photos.shared.of_model.count or Budget.of(settings).allows_matching(photos.shared.matching_seconds)
-    if settings.components.sensor or (is_open and can_match):
-        _find_sensor_depths(found, photos, pool, training_from_scene=extent.training_from_scene, notify=notify)
-    return found
-
-
-def _of_photos(
-    photos: TrainingPhotos,
-    pool: PixelPool,
-    extent: Extent,
-    *,
-    settings: TrainSettings,
-    is_new: bool,
-    notify: Callable[[str], None],
-) -> Evidence:
-    """Return what the photos alone tell; see `collect_evidence`."""
     album, shared, wanted, fixed = photos.album.photos, photos.shared, settings.components, settings.fixed
     budget, threads = Budget.of(settings), settings.threads
     selects = is_new and settings.model == "auto"
@@ -189,26 +171,29 @@ def _of_photos(
     with_exposures = wanted.exposure == "matched" or (wanted.exposure == "learned" and wanted.stereo) or stereo_is_open
     with_occluders = wanted.occluders or (stereo_is_open and "occluders" not in fixed)
     with_depths = stereo_is_open or (wanted.stereo and found.track_depths is not None)
-    if not (with_exposures or with_occluders or with_depths):
-        return found
-    with found.timed("stereo"):
-        dense = dense_depths(album, shared.tracks, longer_side_px=side_px or LEAST_SIDE_PX, threads=threads)
+    dense: Sequence[DenseDepth] = ()
+    if with_exposures or with_occluders or with_depths:
+        with found.timed("stereo"):
+            dense = dense_depths(album, shared.tracks, longer_side_px=side_px or LEAST_SIDE_PX, threads=threads)
     if with_depths:
         found.stereo_depths = dense_points(dense, pool, extent.training_from_scene)
         count = len(found.stereo_depths.numbers)
         notify(f"stereo matching: the depth of {count} pixels of the training photos, {found.seconds['stereo']:.1f} s")
 
-    if not (with_exposures or with_occluders):
-        return found
-    with found.timed("exposures"):
-        log_gains = matched_log_gains(album, dense)
-    if with_exposures:  # those that a user asks for need no confirmation
-        found.log_gains = log_gains if wanted.exposure == "matched" else confirmed_by_exif(log_gains, album)
+    if with_exposures or with_occluders:
+        with found.timed("exposures"):
+            log_gains = matched_log_gains(album, dense)
+        if with_exposures:  # those that a user asks for need no confirmation
+            found.log_gains = log_gains if wanted.exposure == "matched" else confirmed_by_exif(log_gains, album)
+        if with_occluders:
+            with found.timed("occluders"):
+                skies = skies or sky_masks(album, threads=threads)
+                found.occluders = occluder_masks(album, dense, skies, log_gains, threads=threads)
 
-    if with_occluders:
-        with found.timed("occluders"):
-            skies = skies or sky_masks(album, threads=threads)
-            found.occluders = occluder_masks(album, dense, skies, log_gains, threads=threads)
+    sensor_is_open = selects and "sensor" not in fixed and not pool.has_alpha
+    can_match = shared.of_model.count or budget.allows_matching(shared.matching_seconds)
+    if wanted.sensor or (sensor_is_open and can_match):
+        _find_sensor_depths(found, photos, pool, training_from_scene=extent.training_from_scene, notify=notify)
     return found
 
 

@@ -36,6 +36,21 @@ def training_points(coordinates: Tensor, contraction: str) -> Tensor:
     return uncontract((coordinates - 0.5) * 4.0)
 
 
+def step_depths(
+    field: Field, coordinates: Tensor, *, detail: float = 1.0, shortest_step: float, growth: float
+) -> Tensor:
+    """Return the optical depth of a step of a ray at points (N, 3) of the unit cube, (N,); without gradients.
+
+    Args:
+        detail: level of detail of the field, see `Field.medium`.
+        shortest_step, growth: the steps of `Marching`, with the distance from the origin of the training frame.
+    """
+    medium = field.medium(detail)
+    density = torch.cat([field.backend.density(chunk, medium) for chunk in coordinates.split(2**16)])
+    radius = training_points(coordinates, field.settings.contraction).norm(dim=-1)
+    return density * (growth * radius * radius.clamp_min(1.0)).clamp_min(shortest_step)  # as in `Marching.edges`
+
+
 DECAY = 0.8
 
 
@@ -91,12 +106,9 @@ class Occupancy:
         place = torch.stack([numbers % side, numbers // side % side, numbers // side**2], dim=-1)
         inside = torch.rand(len(numbers), 3, generator=generator, device=device)
         coordinates = (place + inside) / side
-        medium = field.medium(detail)
-        density = torch.cat([field.backend.density(chunk, medium) for chunk in coordinates.split(2**16)])
-        radius = training_points(coordinates, field.settings.contraction).norm(dim=-1)
-        step = (growth * radius * radius.clamp_min(1.0)).clamp_min(shortest_step)  # as in `Marching.edges`
+        depths = step_depths(field, coordinates, detail=detail, shortest_step=shortest_step, growth=growth)
         chosen = self.optical_depth.view(-1)[cells]
-        chosen.copy_(torch.maximum(torch.where(chosen.isinf(), 0.0, chosen * DECAY), density * step))
+        chosen.copy_(torch.maximum(torch.where(chosen.isinf(), 0.0, chosen * DECAY), depths))
 
     def state(self) -> dict[str, Tensor]:
         """Return the state for `restore`."""

@@ -143,7 +143,7 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
 
 
 def _stops(spread: float) -> str:
-    """Describe a spread of log exposures in words."""
+    """Describe the spread of exposures between photos in stops."""
     return f"{spread / math.log(2.0):.2g} stops"
 
 

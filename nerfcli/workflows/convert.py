@@ -83,8 +83,8 @@ def _with_frames(source: Path, target: Path, given: UserInputs, *, overwrite: bo
     if video is None or any(frame.has_photo for frame in form.parse(found, given).frames):
         return given
     folder = frames_folder(target.with_suffix("") if target.suffix else target)
-    with reporter.stage(f"extract frames of {video.name}") as told:
-        extract_frames(video, folder, count=None, overwrite=overwrite, notify=told.note, progress=told.progress)
+    with reporter.stage(f"extract frames of {video.name}") as stage:
+        extract_frames(video, folder, count=None, overwrite=overwrite, notify=stage.note, progress=stage.progress)
     return replace(given, images=folder)
 
 

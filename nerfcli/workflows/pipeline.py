@@ -95,41 +95,41 @@ def run_pipeline(
             reporter=reporter,
         )
     run_path = beside(without_suffix(scene), "-run") if output.path is None else Path(output.path) / "run"
-    with reporter.stage(f"train {scene.name}") as told:
-        run = _trained(scene, Output(run_path, again), settings, resources, told)
+    with reporter.stage(f"train {scene.name}") as stage:
+        run = _trained(scene, Output(run_path, again), settings, resources, stage)
     usual = Output(overwrite=again)
-    with reporter.stage("evaluate") as told:
-        evaluation = evaluate_run(run.path, usual, resources=resources, reporter=told)
+    with reporter.stage("evaluate") as stage:
+        evaluation = evaluate_run(run.path, usual, resources=resources, reporter=stage)
     for result in (run.path, evaluation) if found else (scene, run.path, evaluation):
         show(result)
 
     splats = default_target(run.path, "splats")
     if again or not splats.exists():
         half = SplatSettings(budget_seconds=(settings.budget_seconds or 2 * SplatSettings.budget_seconds) / 2)
-        with reporter.stage("export splats") as told:
-            export_run(run.path, usual, to="splats", splats=half, resources=resources, reporter=told)
-    with reporter.stage("evaluate splats") as told:
-        of_splats = evaluate_splats(run.path, splats, usual, resources=resources, reporter=told)
+        with reporter.stage("export splats") as stage:
+            export_run(run.path, usual, to="splats", splats=half, resources=resources, reporter=stage)
+    with reporter.stage("evaluate splats") as stage:
+        of_splats = evaluate_splats(run.path, splats, usual, resources=resources, reporter=stage)
     for result in (of_splats, splats):
         show(result)
 
     renders = []
     for views, outputs, shown in ((Views("test"), OUTPUTS[:3], None), (Views("orbit"), OUTPUTS[:2], splats)):
         wanted = ExportSettings(outputs, usual_depth(run, views), video=VideoSettings() if shown else None)
-        with reporter.stage(f"render {views.name}") as told:
+        with reporter.stage(f"render {views.name}") as stage:
             written = render_run(
-                run.path, usual, views=views, settings=wanted, splats=shown, resources=resources, reporter=told
+                run.path, usual, views=views, settings=wanted, splats=shown, resources=resources, reporter=stage
             )
         for path in written:
             show(path)
         renders += written
-    with reporter.stage("report") as told:
-        report = report_runs([run.path], usual, keep=True, resources=resources, reporter=told)
+    with reporter.stage("report") as stage:
+        report = report_runs([run.path], usual, keep=True, resources=resources, reporter=stage)
     show(report)
     return PipelineResult(scene, run, evaluation, splats, of_splats, renders, report)
 
 
-def _trained(scene: Path, output: Output, settings: TrainSettings, resources: Resources, told: Reporter) -> Run:
+def _trained(scene: Path, output: Output, settings: TrainSettings, resources: Resources, stage: Reporter) -> Run:
     """Train, or go on with a training that was interrupted."""
     path = output.at(scene)
     return train.train_scene(
@@ -138,5 +138,5 @@ def _trained(scene: Path, output: Output, settings: TrainSettings, resources: Re
         settings,
         memory_bytes=resources.memory_limit(settings.device),
         resume=not output.overwrite and train.was_interrupted(scene, path, settings),
-        reporter=told,
+        reporter=stage,
     )

@@ -78,20 +78,20 @@ def estimate_poses(
         folder = photo_folder(files) or files
     elif source.is_file():
         folder = frames_folder(target)
-        with reporter.stage(f"extract frames of {source.name}") as told:
+        with reporter.stage(f"extract frames of {source.name}") as stage:
             extract_frames(
                 source,
                 folder,
                 count=frames,
                 overwrite=output.overwrite,
-                notify=told.note,
-                progress=told.progress,
+                notify=stage.note,
+                progress=stage.progress,
             )
     elif frames is not None:
         reporter.note(f"{source} is not a video: using all of its photos and ignoring --frames")
     calibration = _given_intrinsics(intrinsics, folder)
-    with reporter.stage(f"poses {folder.name}") as told:
-        return _estimated(folder, target, settings, calibration, output, resources=resources, reporter=told)
+    with reporter.stage(f"poses {folder.name}") as stage:
+        return _estimated(folder, target, settings, calibration, output, resources=resources, reporter=stage)
 
 
 def _estimated(

@@ -226,7 +226,7 @@ def _started(
 
 
 def _before(settings: SplatSettings) -> str:
-    """Say what is left after what comes before the refinement, the speed of which says nothing about that."""
+    """Return the budget of the refinement as text, for the stages before it."""
     return f"{duration(settings.budget_seconds)} of refinement left"
 
 
