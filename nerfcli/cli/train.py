@@ -135,7 +135,7 @@ def train(
 
     Unless they are set with --with or --without, points, stereo, sensor, occluders, exposure, cameras, background and
     view are selected automatically. The first four and exposures from matched pixels are used where the photos support
-    them, unless that loses more than 1 dB in a trial. For the rest, short trainings on up to 15 % of the budget keep a
+    them. For the rest, short trainings on up to 15 % of the budget keep a
     component if it improves PSNR by more than the noise, on training pixels left out of these trials. --model default
     skips the selection.
 

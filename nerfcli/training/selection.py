@@ -1,21 +1,21 @@
-"""Select the components of a model: each candidate against the current model, in paired short trainings.
+"""Select the components of a model: by evidence, and by paired short trainings where that does not decide.
 
 A component is added only if its gain exceeds the noise, and removed only if that surely loses hardly anything. Gain
 and noise are measured, not assumed: every candidate continues the same start with the same seeds and pixels as the
-model that it would change, and the variation of the gains between seeds and between photos gives their error. A
-component that is kept is in the model that the next one has to improve: two that correct the same fault are not both
-needed.
+model that it would change, and the variation of the gains between seeds and between photos gives their error. Each is
+tried on top of the components kept so far: of two that correct the same fault, one is enough.
 """
 
 import math
+import time
 from dataclasses import dataclass, replace
 from typing import Any
 
 from nerfcli.matching.camera_check import CameraCheck
 from nerfcli.training.evidence import LEARN_FOCAL, LEAST_MISS_PX, LEAST_SKY_FRACTION, may_use_points
-from nerfcli.training.race import Purse, Race, Support, judge_evidence
 from nerfcli.training.runs.components import CHOICES, MOST_DEGREES, Change, Components, Decision, Selection, untried
 from nerfcli.training.schedule import FEWEST_STEPS, Budget
+from nerfcli.training.search import ADDITION, LIKELY, REMOVAL, SURE, Candidate, Search
 from nerfcli.training.trials import Diagnostics, Trials
 
 # Spread of the photos' brightness, in logarithms of light. Below the first number, exposures do not help; above the
@@ -147,55 +147,57 @@ def _stops(spread: float) -> str:
     return f"{spread / math.log(2.0):.2g} stops"
 
 
-def proposals(
-    start: Components, signs: Diagnostics, facts: Facts
-) -> tuple[dict[Change, tuple[str, Support]], list[Decision]]:
-    """Return changes that may help a scene, each with what was seen, and decisions on those that nothing supports.
+def proposals(start: Components, signs: Diagnostics, facts: Facts) -> tuple[list[Candidate], list[Decision]]:
+    """Return the candidates for a scene, those with the best support first, and decisions on what nothing supports.
 
     Args:
         start: components of the model so far.
         signs: diagnostics of its first training.
     """
-    candidates: dict[Change, tuple[str, Support]] = {}
+    candidates: list[Candidate] = []
     declined: list[Decision] = []
     if start.exposure not in ("matched", "learned"):
         spread = signs.exposure_spread
-        support = Support.LIKELY if spread > LIKELY_EXPOSURE_SPREAD else Support.NONE
-        if facts.has_exif and start.exposure == "none":
-            candidates["exposure", "exif"] = ("EXIF says that exposures differ", support)
+        rule = LIKELY if spread > LIKELY_EXPOSURE_SPREAD else ADDITION
+        if facts.has_exif:
+            candidates.append(Candidate(("exposure", "exif"), "EXIF says that exposures differ", rule))
         if spread > LEAST_EXPOSURE_SPREAD:
-            candidates["exposure", "learned"] = (f"photos differ by {_stops(spread)}", support)
+            candidates.append(Candidate(("exposure", "learned"), f"photos differ by {_stops(spread)}", rule))
         else:
             declined.append(untried(("exposure", "learned"), f"photos differ by only {_stops(spread)}"))
-    check = facts.cameras
+    poses, check = ("cameras", "poses"), facts.cameras
     if facts.cameras_known is not None:
-        declined.append(untried(("cameras", "poses"), facts.cameras_known))
+        declined.append(untried(poses, facts.cameras_known))
     elif check is None:
-        candidates["cameras", "poses"] = ("too few matched features to check them", Support.NONE)
+        candidates.append(Candidate(poses, "too few matched features to check them", ADDITION))
         # In a trial, a right focal length changes as much as a wrong one, because of the coarse field.
         declined.append(untried(("cameras", "focal"), "too few matched features to decide"))
     elif min(check.misses_px) < LEAST_MISS_PX:
-        declined.append(untried(("cameras", "poses"), f"matched features miss by only {min(check.misses_px):.2f} px"))
+        declined.append(untried(poses, f"matched features miss by only {min(check.misses_px):.2f} px"))
     else:
-        candidates["cameras", "poses"] = (f"matched features miss by {min(check.misses_px):.2f} px", Support.SURE)
+        candidates.append(Candidate(poses, f"matched features miss by {min(check.misses_px):.2f} px", SURE))
     if not facts.has_alpha:
-        change = ("background", "sphere")
+        sphere = ("background", "sphere")
         distant = f"{100.0 * signs.far_fraction:.1f} % of the pixels see mostly distant things"
         if facts.sky_fraction > LEAST_SKY_FRACTION:
-            candidates[change] = (f"{100.0 * facts.sky_fraction:.0f} % of the pixels look like a sky", Support.SURE)
+            sky = f"{100.0 * facts.sky_fraction:.0f} % of the pixels look like a sky"
+            candidates.append(Candidate(sphere, sky, SURE))
         elif signs.far_fraction <= LEAST_FAR_FRACTION:
-            declined.append(untried(change, f"only {distant}"))
+            declined.append(untried(sphere, f"only {distant}"))
         elif why := _unlike_a_sky(signs):
-            declined.append(untried(change, f"{distant}, but {why}"))
+            declined.append(untried(sphere, f"{distant}, but {why}"))
         else:
-            support = Support.LIKELY if signs.far_fraction > LIKELY_FAR_FRACTION else Support.NONE
-            candidates[change] = (distant, support)
+            rule = LIKELY if signs.far_fraction > LIKELY_FAR_FRACTION else ADDITION
+            candidates.append(Candidate(sphere, distant, rule))
+    if facts.field == "hash":  # which keeps its shape without it
+        candidates.append(Candidate(("view", 0), "", REMOVAL))
+    order = (SURE, LIKELY, ADDITION, REMOVAL)
     return (
-        {
-            (name, value): why
-            for (name, value), why in candidates.items()
-            if getattr(start, name) != value and name not in facts.fixed
-        },
+        [
+            candidate
+            for candidate in sorted(candidates, key=lambda candidate: order.index(candidate.rule))
+            if candidate.change[0] not in facts.fixed and getattr(start, candidate.change[0]) != candidate.change[1]
+        ],
         [decision for decision in declined if decision.component not in facts.fixed],
     )
 
@@ -208,11 +210,6 @@ def _unlike_a_sky(signs: Diagnostics) -> str | None:
     return f"viewing direction does not explain their colours: {painted:.1f} dB with it, {one:.1f} dB with one colour"
 
 
-def removals(start: Components, facts: Facts) -> list[Change]:
-    """Return changes that remove components from a half-trained model: only for a hash grid, which keeps its shape."""
-    return [("view", 0)] if start.view and "view" not in facts.fixed and facts.field == "hash" else []
-
-
 def _without_poses(model: Components) -> Components:
     """Return the model for trials, without learned poses unless they are what is tried.
 
@@ -222,10 +219,7 @@ def _without_poses(model: Components) -> Components:
 
 
 def select(trials: Trials, requested: Components, facts: Facts, budget: Budget) -> Selection:
-    """Find the components that a scene needs.
-
-    Candidates are compared in a race, see `race.Race`. After that, components of the model are removed if hardly
-    anything is lost.
+    """Find the components that a scene needs: those that evidence supports, and candidates that gain in trials.
 
     Args:
         requested: the components to keep where nothing supports a change.
@@ -234,25 +228,15 @@ def select(trials: Trials, requested: Components, facts: Facts, budget: Budget) 
     Returns:
         The selection; if the budget is too small for a first training of `FEWEST_STEPS`, only what needs no trial.
     """
-    purse = Purse(budget)
+    began = time.perf_counter()
     model, decided = with_evidence(requested, facts)
     start = trials.begin(_without_poses(model), budget.of_start(), fewest=FEWEST_STEPS)
     if start is None:
-        return Selection(model, tuple(decided), purse.spent)
-    purse.charge(start.steps)
-    if decided:
-        without = trials.begin(_without_poses(requested), Budget(None, start.steps))
-        assert without is not None  # no minimum number of steps was given
-        purse.charge(without.steps)
-        # All together: they share one trial.
-        decided = [judge_evidence(without.trial, one, start.trial, by_time=purse.is_time) for one in decided]
-        if not decided[0].kept:
-            model, start = requested, without
+        return Selection(model, tuple(decided))
     candidates, declined = proposals(model, start.signs, facts)
-    race = Race(trials, start, purse, _without_poses(model))
-    race.run(candidates, removals(model, facts))
-    values: dict[str, Any] = dict(race.kept)
-    chosen = replace(model, **values)
+    search = Search(trials, start, _without_poses(model), budget=budget, began=began)
+    search.run(candidates)
+    chosen = replace(model, **search.kept)
     is_found = chosen.exposure == "learned" and model.exposure != "learned"
-    gains = race.log_gains if is_found else None
-    return Selection(chosen, (*decided, *race.decisions.values(), *declined), purse.spent, gains)
+    decisions = (*decided, *search.decisions.values(), *declined)
+    return Selection(chosen, decisions, log_gains=search.log_gains if is_found else None)
