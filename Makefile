@@ -3,6 +3,7 @@
 #   make test    what CI runs: format, lint, types, tests
 #   make test-slow    the long tests, and 2,000 examples of every property
 #   make release    wheel and sdist in dist/, installed in a fresh environment and tried on six photos there
+#   make figures DATA=folder    measures docs/figures.md on captures, for hours; it can be stopped and started again
 #   make clean   remove .venv, demo/ and all caches
 # Demo and test make .venv first, once. With a Python of your choice: make test PYTHON=/opt/python/bin/python3.13
 
@@ -12,7 +13,7 @@ BIN = .venv/bin
 PIP_INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow release clean
+.PHONY: demo test test-slow release figures clean
 
 demo: .venv/installed
 	$(BIN)/nerfcli run sample_scenes/desk/images -o demo --budget 90s --downscale 2
@@ -45,6 +46,9 @@ release: .venv/installed-dev
 	cd release-check && env/bin/nerfcli --version && env/bin/nerfcli run photos --budget 10s
 	du -sh dist/* release-check/env
 
+figures: .venv/installed
+	$(BIN)/python benchmarks/figures.py $(DATA)
+
 .venv/installed: $(BIN)/python pyproject.toml constraints.txt
 	$(PIP_INSTALL) -e .
 	@touch $@
@@ -72,5 +76,5 @@ $(BIN)/python:
 	echo "Python 3.11 or newer is needed;$${found:- none found;} name one with PYTHON=/path/to/python" >&2; exit 1
 
 clean:
-	rm -rf .venv demo build dist release-check nerfcli.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv demo figures build dist release-check nerfcli.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -191,6 +191,37 @@ def draw(photo: Path, depth: np.ndarray, truth: np.ndarray, path: Path) -> None:
     cv2.imwrite(str(path), np.concatenate(sheets, axis=1))
 
 
+def errors_of_run(
+    run: Path, capture: Path | None, output: Path, *, views: int = 6, min_opacity: float = 0.5
+) -> list[Errors]:
+    """Return the errors of every depth of a run, and draw a picture per view into the folder `output`.
+
+    Args:
+        run: of the desk with its true cameras, or of redkitchen.
+        capture: the folder of redkitchen, None for the desk.
+        output: for the pictures.
+        views: held-out views at most, evenly chosen.
+        min_opacity: as in nerfcli render.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    kernels.prepare(print)
+    model = load_model(run / FIELD, "cpu")
+    cameras = read_cameras(run)
+    test = cameras.test
+    metres = 1.0 if capture is None else kitchen_metres([*cameras.train, *test], capture)
+    chosen = [test[index] for index in np.unique(np.linspace(0, len(test) - 1, views).round().astype(int))]
+    whole = [desk_truth(frame) if capture is None else kitchen_truth(frame, capture) for frame in chosen]
+    truths = [truth[::STRIDE, ::STRIDE] for truth in whole]
+    looks = chosen if capture is None else [kitchen_depth_view(frame, capture, metres=metres) for frame in chosen]
+    maps = [
+        {name: metres * depth for name, depth in depths(model, look, min_opacity=min_opacity).items()} for look in looks
+    ]
+    for frame, one, truth in zip(chosen, maps, truths, strict=True):
+        assert frame.image is not None
+        draw(frame.image, one["conditional"], truth, output / f"{Path(frame.name).stem}.png")
+    return measure(maps, truths)
+
+
 def main(
     capture: Annotated[str, typer.Argument(help="desk or redkitchen.")],
     folder: Annotated[Path | None, typer.Argument(help="Of the redkitchen capture.")] = None,
@@ -221,27 +252,10 @@ def main(
         limit = ("--budget", budget) if not budget.isdigit() else ("--steps", budget)
         options = (*limit, "--downscale", downscale, "--threads", str(threads), "--overwrite")
         subprocess.run([sys.executable, "-m", "nerfcli", "train", str(scene), "-o", str(run), *options], check=True)
-    output.mkdir(parents=True, exist_ok=True)
-    kernels.prepare(print)
-    model = load_model(run / FIELD, "cpu")
-    cameras = read_cameras(run)
-    test = cameras.test
-    metres = 1.0 if folder is None else kitchen_metres([*cameras.train, *test], folder)
-    chosen = [test[index] for index in np.unique(np.linspace(0, len(test) - 1, views).round().astype(int))]
-    whole = [desk_truth(frame) if folder is None else kitchen_truth(frame, folder) for frame in chosen]
-    truths = [truth[::STRIDE, ::STRIDE] for truth in whole]
-    looks = chosen if folder is None else [kitchen_depth_view(frame, folder, metres=metres) for frame in chosen]
-    maps = [
-        {name: metres * depth for name, depth in depths(model, look, min_opacity=min_opacity).items()} for look in looks
-    ]
-    rows = measure(maps, truths)
-    for frame, one, truth in zip(chosen, maps, truths, strict=True):
-        assert frame.image is not None
-        draw(frame.image, one["conditional"], truth, output / f"{Path(frame.name).stem}.png")
-
+    rows = errors_of_run(run, folder, output, views=views, min_opacity=min_opacity)
     table = Table(
         *("depth along z", "coverage", "median cm", "RMSE cm", "within 1 %", "within 5 %", "bias cm"),
-        title=f"{capture}: {len(chosen)} held-out views, opacity >= {min_opacity:g}, {metres:.4g} m per unit",
+        title=f"{capture}: {views} held-out views at most, opacity >= {min_opacity:g}",
     )
     for row in rows:
         table.add_row(

@@ -4,9 +4,9 @@
     python benchmarks/poses.py captures/redkitchen/handheld_video.mp4 captures/banana -o poses --qualities default
 
 A capture is a folder with photos in images/, or a video. Its truth is read from a file or folder beside them:
-transforms.json, cameras_sphere.npz (projection matrices, as in IDR and NeuS), or pose/ with a camera-to-world matrix
-per frame. Without truth only the counts are printed. Calls `nerfcli poses`, to measure what users get; existing scenes
-in OUT-scenes/ are reused. Writes OUT.csv and prints a table.
+transforms.json, cameras_sphere.npz (projection matrices, as in IDR and NeuS), pose/ with a camera-to-world matrix per
+frame, or truth/cameras.json of sample_scenes/desk. Without truth only the counts are printed. Calls `nerfcli poses`,
+to measure what users get; existing scenes in OUT-scenes/ are reused. Writes OUT.csv and prints a table.
 
 How to read it: ATE is the RMS distance of camera centres from the true ones after the best similarity, over the RMS
 distance of the true ones from their mean. Rotations are compared after the same similarity. "own axes" is the rotation
@@ -149,6 +149,10 @@ def read_truth(capture: Path, photos: Path) -> Truth:
         return _truth_of_matrices(home / "pose", photos, names)
     if (home / "cameras_sphere.npz").is_file():
         return _truth_of_projections(home / "cameras_sphere.npz", photos, names)
+    if (home / "truth" / "cameras.json").is_file():
+        known = json.loads((home / "truth" / "cameras.json").read_text(encoding="utf-8"))
+        poses = {image["name"]: np.array(image["world_from_cam"]) for image in known["images"]}
+        return Truth(poses, dict.fromkeys(poses, known["camera"]["params"][0]))
     if (home / "transforms.json").is_file():
         frames = load_scene(home / "transforms.json").frames
         poses = {Path(frame.name).name: frame.world_from_cam for frame in frames}

@@ -23,13 +23,15 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+NAN = float("nan")
+
 
 @dataclass(frozen=True)
 class Training:
     """One training, and its results of `evaluate` over whole held-out photos.
 
-    `dip_db` is the best logged PSNR of some held-out pixels minus the last one; `kept` lists the changes that the
-    search kept.
+    `lpips` is NaN where it is not installed; `dip_db` is the best logged PSNR of some held-out pixels minus the last
+    one; `kept` lists the changes that the search kept.
     """
 
     scene: str
@@ -38,6 +40,7 @@ class Training:
     seed: int
     psnr: float
     ssim: float
+    lpips: float
     dip_db: float
     kept: str
     search_s: float
@@ -53,16 +56,16 @@ def nerfcli(*arguments: str) -> str:
     return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
-def measure(scene: Path, budget: float, model: str, seed: int, *, threads: int) -> Training:
-    """Train and evaluate once."""
-    with tempfile.TemporaryDirectory() as folder:
-        run = Path(folder) / "run"
-        common = ("--threads", str(threads), "--quiet")
-        options = ("--budget", f"{budget}s", "--model", model, "--seed", str(seed))
-        nerfcli("train", str(scene), "-o", str(run), *options, *common)
-        metrics: dict[str, Any] = json.loads(nerfcli("evaluate", str(run), "--json", *common))
-        log = [json.loads(line) for line in (run / "log.jsonl").read_text(encoding="utf-8").splitlines()]
-        selection = json.loads((run / "config.json").read_text(encoding="utf-8")).get("selection") or {}
+def measure(
+    scene: Path, budget: float, model: str, seed: int, *, threads: int, run: Path, downscale: str = "auto"
+) -> Training:
+    """Train into the folder `run`, and evaluate once."""
+    common = ("--threads", str(threads), "--quiet")
+    options = ("--budget", f"{budget}s", "--model", model, "--seed", str(seed), "--downscale", downscale)
+    nerfcli("train", str(scene), "-o", str(run), *options, *common)
+    metrics: dict[str, Any] = json.loads(nerfcli("evaluate", str(run), "--json", *common))
+    log = [json.loads(line) for line in (run / "log.jsonl").read_text(encoding="utf-8").splitlines()]
+    selection = json.loads((run / "config.json").read_text(encoding="utf-8")).get("selection") or {}
     course = [entry["heldout_psnr"] for entry in log if "heldout_psnr" in entry]
     kept = [f"{one['component']}={one['value']}" for one in selection.get("decisions", []) if one["kept"]]
     training = metrics["training"]
@@ -73,6 +76,7 @@ def measure(scene: Path, budget: float, model: str, seed: int, *, threads: int) 
         seed=seed,
         psnr=round(metrics["mean"]["psnr"], 3),
         ssim=round(metrics["mean"]["ssim"], 4),
+        lpips=NAN if metrics["mean"]["lpips"] is None else round(metrics["mean"]["lpips"], 4),
         dip_db=round(max(course) - course[-1], 3),
         kept=" ".join(kept),
         search_s=round(selection.get("seconds", 0.0), 1),
@@ -155,7 +159,9 @@ def main(
                 for model in models.split(","):
                     if (scene.name, budget, model, seed) in finished:
                         continue
-                    done.append(measure(scene, budget, model, seed, threads=threads))
+                    with tempfile.TemporaryDirectory() as folder:
+                        run = Path(folder) / "run"
+                        done.append(measure(scene, budget, model, seed, threads=threads, run=run))
                     with path.open("a", newline="", encoding="utf-8") as file:
                         csv.DictWriter(file, names).writerow(asdict(done[-1]))
                     Console(stderr=True).print(done[-1])

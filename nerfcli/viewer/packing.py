@@ -25,7 +25,7 @@ from nerfcli.render.tracing import uniform_cuts
 # Features per texel of the table, and neurons along a side of a block of the networks.
 FOUR = 4
 LEVELS = 32767
-# This step changes colours by 5e-5 (rms) and keeps a page of 2^18 rows below 10 MB; see docs/figures.md for others.
+# This step changes colours by 5e-5 (rms) and keeps a page of 2^18 rows below 10 MB.
 FINEST_LEVEL = 2.0**-11
 # Occupied cells of hashed grids with more vertices than this are taken to reach every row.
 MOST_VERTICES = 2**24
