@@ -24,8 +24,8 @@ def project(folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("files", "said"),
     [
-        ((), "expected files ending in"),
-        (("a.psd", "b.psd", "notes.txt"), "there are only 2 .psd, 1 .txt; expected files ending in"),
+        ((), "expected .jpg, .png, .heic, "),
+        (("a.psd", "b.psd", "notes.txt"), "there are only 2 .psd, 1 .txt; expected .jpg, "),
         (("DCIM/a.jpg",), "there are photos in {0}/DCIM; give that folder"),
     ],
 )

@@ -380,7 +380,7 @@ def where_photos_may_be(folder: Path) -> str:
         more = f" and {len(with_photos) - 1} more folders" if len(with_photos) > 2 else f" and {with_photos[1]}"
         return f"there are photos in {with_photos[0]}{more}; give one of them, or use all with --subfolders"
     there = f"there are only {skipped}; " if (skipped := skipped_files(folder)) else ""
-    return f"{there}expected files ending in {', '.join(sorted(IMAGE_SUFFIXES))}"
+    return f"{there}expected .jpg, .png, .heic, .tif, .webp or another of the {len(IMAGE_SUFFIXES)} suffixes of photos"
 
 
 def _folders(folder: Path, *, subfolders: bool) -> list[Path]:

@@ -111,8 +111,11 @@ def recognise(path: Path) -> tuple[Format, Path]:
             f"{photos} has {several(len(list_images(photos)), 'photo')} but no cameras",
             f"{other}estimate them with: nerfcli poses {in_shell(photos)}",
         )
-    looked_for = ", ".join(dict.fromkeys(form.looked_for for form in FORMATS if form.looked_for))
-    raise UserError(f"{path} contains no capture in a supported format", f"looked for {looked_for}")
+    usual = ", ".join(form.looked_for for form in FORMATS if form.name in ("nerfcli", "colmap", "transforms"))
+    raise UserError(
+        f"{path} contains no capture in a supported format",
+        f"looked for {usual} and the files of many more programs: nerfcli convert --help lists them",
+    )
 
 
 def _captures_in(path: Path) -> list[Path]:
