@@ -23,7 +23,7 @@ from nerfcli.evaluate.photos import (
 from nerfcli.evaluate.protocol import PROTOCOL, Extras, RunMetrics, evaluate_model
 from nerfcli.evaluate.requirements import WHY_ABSENT, Requirement, known_numbers, unmet
 from nerfcli.machine import Resources
-from nerfcli.notices import Reporter
+from nerfcli.notices import Reporter, silent
 from nerfcli.output import Output
 from nerfcli.render.job import file_names
 from nerfcli.training.runs.files import LOG
@@ -142,7 +142,8 @@ def evaluate_splats(
         scene,
         held_out,
         on_image=lambda done, total: reporter.progress(done / total, f"of {total} pixels"),
-        extras=Extras(trained.cameras.train, find_perceptual(reporter.note)),
+        # The evaluation of the field has already said why there is no LPIPS.
+        extras=Extras(trained.cameras.train, find_perceptual(silent)),
     )
     metrics = replace(
         metrics,
