@@ -76,5 +76,5 @@ $(BIN)/python:
 	echo "Python 3.11 or newer is needed;$${found:- none found;} name one with PYTHON=/path/to/python" >&2; exit 1
 
 clean:
-	rm -rf .venv demo figures build dist release-check nerfcli.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv demo figure-runs build dist release-check nerfcli.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -7,7 +7,7 @@
 `captures/` holds the folders that `CAPTURES` names, with photos in images/ or cameras of their own; desk is in
 sample_scenes. Calls the commands as a user does, and adds every finished cell to the JSON file with commit, date and
 processor. Cells of this commit (the last one that changed nerfcli/) are not measured again, so that it can be stopped
-at any time and started again. Scenes and runs are kept in figures/COMMIT. Run nothing else meanwhile.
+at any time and started again. Scenes and runs are kept in figure-runs/COMMIT. Run nothing else meanwhile.
 """
 
 import json
@@ -141,7 +141,7 @@ class Measurement:
             nerfcli(
                 "export", str(run), "--to", "splats", "-o", str(file), "--budget", SPLATS_BUDGET, "--overwrite", *common
             )
-        files["page"] = run.with_suffix(".html")
+        files["page"] = run.with_name(f"{run.name}.html")
         nerfcli("export", str(run), "--to", "page", "-o", str(files["page"]), "--overwrite", *common)
         (field, ply), (_, spz) = (self.beside_field(run, files[suffix]) for suffix in ("ply", "spz"))
         return {
@@ -151,7 +151,7 @@ class Measurement:
             "ssim": ply["mean"]["ssim"],
             "spz_psnr": spz["mean"]["psnr"],
             "render_s": ply["render"]["seconds_per_image"],
-            **{f"{name}_mb": file.stat().st_size / 1e6 for name, file in files.items()},
+            **{f"{kind}_mb": file.stat().st_size / 1e6 for kind, file in files.items()},
             "page_psnr": self.page_psnr(files["page"]),
         }
 
@@ -263,6 +263,11 @@ def origin(cell: Cell) -> tuple[str, str]:
     return cell["commit"], cell["processor"]
 
 
+def program_commit() -> str:
+    """Return the last commit that changed the program."""
+    return subprocess.check_output(["git", "log", "-1", "--format=%h", "--", "nerfcli"], cwd=ROOT, text=True).strip()
+
+
 def main(
     captures: Annotated[Path | None, typer.Argument(help="Folder of captures; without it, only the page.")] = None,
     budgets: Annotated[str, typer.Option(help="Of training.")] = "60s,5m,30m",
@@ -274,9 +279,8 @@ def main(
     cells = read_cells(path)
     failed = 0
     if captures is not None:
-        log = subprocess.check_output(["git", "log", "-1", "--format=%h", "--", "nerfcli"], cwd=ROOT, text=True)
-        where = {"commit": log.strip(), "processor": processor_name(), "threads": THREADS}
-        measurement = Measurement(captures, ROOT / "figures" / where["commit"])
+        where = {"commit": program_commit(), "processor": processor_name(), "threads": THREADS}
+        measurement = Measurement(captures, ROOT / "figure-runs" / program_commit())
         for kind, name, budget in plan(names.split(","), [seconds_from_text(one) for one in budgets.split(",")]):
             what = {"kind": kind, "capture": name, "budget_s": budget}
             if any((what | where).items() <= cell.items() for cell in cells):
@@ -284,8 +288,8 @@ def main(
             began = time.monotonic()
             try:
                 numbers = getattr(measurement, kind)(name, budget)
-            # A command that fails has said why; the other cells are measured nevertheless.
-            except (subprocess.CalledProcessError, SystemExit):
+            except (Exception, SystemExit) as error:  # the other cells are still useful
+                print(f"{kind} {name} {budget:g}: {type(error).__name__}: {error}", flush=True)
                 failed += 1
                 continue
             seconds = time.monotonic() - began

@@ -51,6 +51,7 @@ def test_a_cell_is_measured_once_for_a_commit_and_kept_at_once(monkeypatch, tmp_
             raise subprocess.CalledProcessError(1, "nerfcli poses")
         return {"total_s": 12.3456, "ate": float("nan")}
 
+    monkeypatch.setattr(figures, "program_commit", lambda: "abc1234")
     monkeypatch.setattr(figures, "plan", lambda names, budgets: [("poses", name, 0.0) for name in names])
     monkeypatch.setattr(figures.Measurement, "poses", poses)
     path = tmp_path / "figures.json"
