@@ -39,10 +39,10 @@ def _add_colours(
 
 @numba.njit(nogil=True, error_model="numpy")
 def _trace(
-    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
-    flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, cones: Any, harmonics: Any, negligible: Any,
-    targets: Any, coming: Any, last_ray: Any, sums: Any, quantiles: Any, colours: Any, unseen: Any, counts: Any,
-    owner: Any, record: Any,
+    origins: Any, directions: Any, edges: Any, chunks: Any, jitter: Any, occupied: Any, blocks: Any, side: Any,
+    contraction: Any, flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, cones: Any, harmonics: Any,
+    negligible: Any, targets: Any, coming: Any, last_ray: Any, sums: Any, quantiles: Any, colours: Any, unseen: Any,
+    counts: Any, owner: Any, record: Any,
 ) -> Any:  # fmt: skip
     """Trace rays from `coming` up to `last_ray`, adding to their rows of sums, quantiles, colours and unseen weight.
 
@@ -52,7 +52,9 @@ def _trace(
         number of samples written.
     """
     intervals = edges.shape[0] - 2 - CHUNK
-    (lane_ray, lane_next, lane_depth), (places, cells), (sample_lane, sample_span, points) = new_round()
+    (lane_ray, lane_next, lane_depth, lane_near), (places, cells, needed), (sample_lane, sample_span, points) = (
+        new_round()
+    )
     widths = np.empty(ROUND if cones.shape[0] > 0 else 0, np.float32)
     encoded = np.empty(ROUND * WIDTH, np.float32)
     scratch = new_scratch()
@@ -64,8 +66,8 @@ def _trace(
     found, keep = 0, len(owner) > 0
     while True:
         filled, coming = fill_round(
-            origins, directions, edges, jitter, occupied, blocks, side, contraction, cones, coming, last_ray, lane_ray,
-            lane_next, lane_depth, places, cells, sample_lane, sample_span, points, widths,
+            origins, directions, edges, chunks, jitter, occupied, blocks, side, contraction, cones, coming, last_ray,
+            lane_ray, lane_next, lane_depth, lane_near, places, cells, needed, sample_lane, sample_span, points, widths,
         )  # fmt: skip
         if filled == 0:
             break
@@ -106,17 +108,17 @@ def _trace(
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _trace_all(
-    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
-    flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, cones: Any, harmonics: Any, negligible: Any,
-    targets: Any, borders: Any, sums: Any, quantiles: Any, colours: Any, unseen: Any, counts: Any, owner: Any,
-    record: Any, found: Any,
+    origins: Any, directions: Any, edges: Any, chunks: Any, jitter: Any, occupied: Any, blocks: Any, side: Any,
+    contraction: Any, flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, cones: Any, harmonics: Any,
+    negligible: Any, targets: Any, borders: Any, sums: Any, quantiles: Any, colours: Any, unseen: Any, counts: Any,
+    owner: Any, record: Any, found: Any,
 ) -> None:  # fmt: skip
     """Call `_trace` in parallel, with one thread for the rays from each border to the next."""
     for thread in numba.prange(len(borders) - 1):
         found[thread] = _trace(
-            origins, directions, edges, jitter, occupied, blocks, side, contraction, flat, rows, resolutions, weights,
-            deepest, cones, harmonics, negligible, targets, borders[thread], borders[thread + 1], sums, quantiles,
-            colours, unseen, counts, owner[thread], record[thread],
+            origins, directions, edges, chunks, jitter, occupied, blocks, side, contraction, flat, rows, resolutions,
+            weights, deepest, cones, harmonics, negligible, targets, borders[thread], borders[thread + 1], sums,
+            quantiles, colours, unseen, counts, owner[thread], record[thread],
         )  # fmt: skip
 
 

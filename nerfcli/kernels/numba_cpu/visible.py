@@ -13,101 +13,20 @@ import torch
 
 from nerfcli.kernels.contraction import CONTRACTIONS
 from nerfcli.kernels.interface import OUT, WIDTH, HashGrid, March, Rays, Samples
+from nerfcli.kernels.numba_cpu.empty_space import WINDOW, blocks_of, chunks_near, chunks_of
 from nerfcli.kernels.numba_cpu.hash_grid import encode_range, new_scratch
 from nerfcli.kernels.numba_cpu.marching import keep_largest
 from nerfcli.kernels.numba_cpu.networks import TILE, density_range, flat_weights
-from nerfcli.kernels.numba_cpu.rays import CHUNK, cube, cut, look_ahead, padded
+from nerfcli.kernels.numba_cpu.rays import CHUNK, cut, look_ahead, padded
 from nerfcli.kernels.numba_cpu.threads import use_threads
 
 # Rays that a thread works on at a time, and samples that each of them looks ahead.
 LANES = 256
 AHEAD = 4
 ROUND = LANES * AHEAD
-# Rounding of positions and distances in float32 must not skip a cell.
-_ROUNDED_DOWN = np.float32(0.999)
 # Room for the samples of each thread, 92 MB; if there are more, all are found again with room for every step of every
 # ray. That would be up to 1.7 GB in each step, and trainings would keep the pages that any of them has touched.
 USUAL_SAMPLES = 2**19
-
-
-@numba.njit(nogil=True, error_model="numpy")
-def _is_occupied(occupied: Any, z: Any, y: Any, x: Any, width: Any) -> Any:
-    """Return whether the block of `width` cells that begins at cell (z, y, x) has an occupied cell."""
-    side = occupied.shape[0]
-    for k in range(z, min(z + width, side)):
-        for j in range(y, min(y + width, side)):
-            for i in range(x, min(x + width, side)):
-                if occupied[k, j, i]:
-                    return True
-    return False
-
-
-@numba.njit(inline="always")
-def _block_width(side: Any, blocks: Any) -> Any:
-    """Return the width in cells of each of `blocks` that share an axis of `side` cells."""
-    return -(-side // blocks)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def nearby_blocks(occupied: Any) -> Any:
-    """Return the distance from each block of cells to the nearest that has an occupied cell: 0, 1, or 2 for more.
-
-    Far less exact than `kernels.distances_to_occupied`, and fast enough for every step of a training.
-    """
-    side = occupied.shape[0]
-    blocks = -(-side // max(side // 16, 4))
-    width = _block_width(side, blocks)
-    distance = np.full((blocks, blocks, blocks), 2, np.uint8)
-    for z in range(blocks):
-        for y in range(blocks):
-            for x in range(blocks):
-                if _is_occupied(occupied, z * width, y * width, x * width, width):
-                    near = distance[max(z - 1, 0) : z + 2, max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
-                    near[:] = np.minimum(near, np.uint8(1))
-                    distance[z, y, x] = 0
-    return distance
-
-
-@numba.njit(inline="always")
-def _place(along: Any, width: Any, blocks: Any) -> Any:
-    """Return the block of a coordinate along one axis, and the distance to its nearer end in blocks; it is clamped."""
-    scaled = min(max(along, np.float32(0)), np.float32(1)) / width
-    block = min(np.int64(scaled), blocks - 1)
-    inside = scaled - np.float32(block)
-    return block, min(inside, np.float32(1) - inside)
-
-
-@numba.njit(inline="always")
-def _free_until(origins: Any, directions: Any, ray: Any, t: Any, blocks: Any, width: Any, contraction: Any) -> Any:
-    """Return a distance up to which a ray meets no occupied cell from distance t on.
-
-    The cube around a point that reaches to the nearest occupied block is empty. Coordinates of the unit cube change by
-    at most 1/2 per unit of distance; where space is contracted, by 1/4 within the unit ball, and outside by less, most
-    where the ray is nearest to the origin.
-    """
-    half, quarter, one, two = np.float32(0.5), np.float32(0.25), np.float32(1), np.float32(2)
-    x, y, z = (
-        origins[ray, 0] + directions[ray, 0] * t,
-        origins[ray, 1] + directions[ray, 1] * t,
-        origins[ray, 2] + directions[ray, 2] * t,
-    )
-    a, b, c = cube(x, y, z, contraction)
-    count = blocks.shape[0]
-    (i, u), (j, v), (k, w) = _place(a, width, count), _place(b, width, count), _place(c, width, count)
-    distance = blocks[k, j, i]
-    if distance == 0:
-        return t
-    free = (np.float32(distance) - one + max(min(u, v, w), np.float32(0))) * width
-    rate = half
-    if contraction != 0:
-        square, outwards = (
-            x * x + y * y + z * z,
-            x * directions[ray, 0] + y * directions[ray, 1] + z * directions[ray, 2],
-        )
-        least = square - outwards * outwards if outwards < np.float32(0) else square
-        norm = np.sqrt(max(least, one))
-        rate = (two - one / norm) / norm * quarter
-    return t + free / rate * _ROUNDED_DOWN
 
 
 @numba.njit(inline="always")
@@ -124,28 +43,29 @@ def _stretch(origins: Any, directions: Any, ray: Any, t: Any, contraction: Any) 
 
 @numba.njit(inline="always")
 def new_round() -> Any:
-    """Return lanes without rays, scratch space for `look_ahead`, and room for the samples of a `fill_round`."""
-    lanes = np.full(LANES, -1, np.int64), np.zeros(LANES, np.int64), np.zeros(LANES, np.float64)
-    look = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32)
+    """Return lanes without rays, scratch space for looking ahead, and room for the samples of a `fill_round`."""
+    lanes = np.full(LANES, -1, np.int64), np.zeros(LANES, np.int64), np.zeros(LANES), np.zeros(LANES, np.int64)
+    look = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32), np.empty(WINDOW, np.float32)
     samples = np.empty(ROUND, np.int64), np.empty((ROUND, 2), np.float32), np.empty((3, ROUND), np.float32)
     return lanes, look, samples
 
 
 @numba.njit(nogil=True, error_model="numpy")
 def fill_round(
-    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
-    cones: Any, coming: Any, last_ray: Any, lane_ray: Any, lane_next: Any, lane_depth: Any, places: Any, cells: Any,
-    sample_lane: Any, sample_span: Any, points: Any, widths: Any,
+    origins: Any, directions: Any, edges: Any, chunks: Any, jitter: Any, occupied: Any, blocks: Any, side: Any,
+    contraction: Any, cones: Any, coming: Any, last_ray: Any, lane_ray: Any, lane_next: Any, lane_depth: Any,
+    lane_near: Any, places: Any, cells: Any, needed: Any, sample_lane: Any, sample_span: Any, points: Any, widths: Any,
 ) -> Any:  # fmt: skip
     """Find the next samples of the rays in the lanes, up to AHEAD each; a lane without a ray takes the ray `coming`.
 
+    `lane_near` holds the number of the window of chunks in which a lane is, and the bits of its `chunks_near`.
     A sample's lane, start and end, coordinates and width are written to the last four arrays.
 
     Returns:
         number of samples found, and the ray that the next empty lane takes.
     """
     intervals = edges.shape[0] - 2 - CHUNK
-    width = np.float32(_block_width(side, blocks.shape[0]) / side)
+    flat_blocks, width = blocks.reshape(-1), np.float32(-(-side // blocks.shape[0]) / side)
     filled = 0
     for lane in range(LANES):
         taken = 0
@@ -153,15 +73,23 @@ def fill_round(
             if lane_ray[lane] < 0:
                 if coming == last_ray:
                     break
-                lane_ray[lane], lane_next[lane], lane_depth[lane] = coming, 0, 0.0
+                lane_ray[lane], lane_next[lane], lane_depth[lane], lane_near[lane] = coming, 0, 0.0, -1
                 coming += 1
             ray, k = lane_ray[lane], lane_next[lane]
             while k < intervals and taken == 0:
-                first, start = k, cut(edges, jitter[ray], k)
-                free = _free_until(origins, directions, ray, start, blocks, width, contraction)
-                while k + CHUNK < intervals and cut(edges, jitter[ray], k + CHUNK) < free:
-                    k += CHUNK
-                if k > first:
+                chunk = k // CHUNK
+                window = chunk // WINDOW
+                if lane_near[lane] >> WINDOW != window:
+                    near = chunks_near(
+                        origins, directions, ray, chunks, window * WINDOW, flat_blocks, blocks.shape[0], width,
+                        contraction, cells, needed,
+                    )  # fmt: skip
+                    lane_near[lane] = window << WINDOW | near
+                near = lane_near[lane]
+                while chunk // WINDOW == window and not near >> chunk % WINDOW & 1:
+                    chunk += 1
+                if chunk > k // CHUNK:
+                    k = chunk * CHUNK
                     continue
                 look_ahead(origins, directions, edges, jitter, ray, k, side, contraction, places, cells)
                 past = min(CHUNK, intervals - k)
@@ -189,9 +117,9 @@ def fill_round(
 
 @numba.njit(nogil=True, error_model="numpy")
 def _follow(
-    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
-    flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, least: Any, cones: Any, coming: Any,
-    last_ray: Any, counts: Any, owner: Any, record: Any, code: Any, left: Any,
+    origins: Any, directions: Any, edges: Any, chunks: Any, jitter: Any, occupied: Any, blocks: Any, side: Any,
+    contraction: Any, flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, least: Any, cones: Any,
+    coming: Any, last_ray: Any, counts: Any, owner: Any, record: Any, code: Any, left: Any,
 ) -> Any:  # fmt: skip
     """Write the samples of rays from `coming` up to `last_ray`, in the order in which they are found.
 
@@ -200,7 +128,9 @@ def _follow(
     first -1 if there is not enough room.
     """
     intervals = edges.shape[0] - 2 - CHUNK
-    (lane_ray, lane_next, lane_depth), (places, cells), (sample_lane, sample_span, points) = new_round()
+    (lane_ray, lane_next, lane_depth, lane_near), (places, cells, needed), (sample_lane, sample_span, points) = (
+        new_round()
+    )
     widths = np.empty(ROUND if cones.shape[0] > 0 else 0, np.float32)
     encoded = np.empty((ROUND, WIDTH), np.float32)
     density = np.empty(ROUND, np.float32)
@@ -210,8 +140,8 @@ def _follow(
     found = missing = 0
     while True:
         filled, coming = fill_round(
-            origins, directions, edges, jitter, occupied, blocks, side, contraction, cones, coming, last_ray, lane_ray,
-            lane_next, lane_depth, places, cells, sample_lane, sample_span, points, widths,
+            origins, directions, edges, chunks, jitter, occupied, blocks, side, contraction, cones, coming, last_ray,
+            lane_ray, lane_next, lane_depth, lane_near, places, cells, needed, sample_lane, sample_span, points, widths,
         )  # fmt: skip
         if filled == 0:
             return found, missing
@@ -250,15 +180,15 @@ def _follow(
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _visible(
-    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
-    flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, least: Any, cones: Any, borders: Any,
-    counts: Any, owner: Any, record: Any, code: Any, left: Any, found: Any, missing: Any,
+    origins: Any, directions: Any, edges: Any, chunks: Any, jitter: Any, occupied: Any, blocks: Any, side: Any,
+    contraction: Any, flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, least: Any, cones: Any,
+    borders: Any, counts: Any, owner: Any, record: Any, code: Any, left: Any, found: Any, missing: Any,
 ) -> None:  # fmt: skip
     """Call `_follow` in parallel, with one thread for the rays from each border to the next."""
     counts[:] = 0
     for thread in numba.prange(len(borders) - 1):
         found[thread], missing[thread] = _follow(
-            origins, directions, edges, jitter, occupied, blocks, side, contraction, flat, rows,
+            origins, directions, edges, chunks, jitter, occupied, blocks, side, contraction, flat, rows,
             resolutions, weights, deepest, least, cones, borders[thread], borders[thread + 1], counts, owner[thread],
             record[thread], code[thread], left[thread],
         )  # fmt: skip
@@ -283,16 +213,12 @@ def _sort(
                 encoded[to, feature] = code[thread, i, feature]
 
 
-def _blocks(along: March) -> np.ndarray:
-    """Return the distances to occupied cells of a march, made of its cells if it has none."""
-    return nearby_blocks(along.occupied.numpy()) if along.distances is None else along.distances.numpy()
-
-
 def flat_arguments(rays: Rays, along: March, grid: HashGrid, layers: tuple[torch.Tensor, ...]) -> tuple[Any, ...]:
     """Return rays, occupied cells, table and layers as the arrays that `_follow` takes, up to `deepest`."""
+    edges = padded(along.edges)
     return (
-        rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy(), padded(along.edges),
-        rays.jitter.numpy(), along.occupied.contiguous().view(-1).numpy(), _blocks(along),
+        rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy(), edges, chunks_of(edges),
+        rays.jitter.numpy(), along.occupied.contiguous().view(-1).numpy(), blocks_of(along),
         along.occupied.shape[0], CONTRACTIONS.index(along.contraction),
         grid.table.detach().contiguous().view(-1).numpy(), grid.table.shape[1],
         np.array(grid.resolutions, dtype=np.int32), flat_weights(layers), along.max_optical_depth,
