@@ -24,7 +24,7 @@ from nerfcli.captures.formats.registry import format_named
 from nerfcli.captures.formats.scene_folder import write_scene
 from nerfcli.captures.formats.transforms import write_transforms
 from nerfcli.captures.loading import load_scene
-from nerfcli.captures.stored_pixels import in_pixels
+from nerfcli.captures.orientation import in_pixels
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, UserError
 from nerfcli.photos.images import read_image
 

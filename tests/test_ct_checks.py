@@ -11,8 +11,8 @@ from commands import error_of, nerfcli
 from ellipsoids import Ellipsoid
 from scan_of_phantom import phantom_circle, scan_of_phantom
 
-from nerfcli.ct.checks.examine import CHECKS, examine_scan
-from nerfcli.ct.checks.sample import sample_of
+from nerfcli.ct.checks import sample_of
+from nerfcli.ct.examine import CHECKS, examine_scan
 from nerfcli.ct.scan import Scan, save_scan
 from nerfcli.errors import GATE_NOT_MET
 from nerfcli.pages.findings import Finding

@@ -11,11 +11,11 @@ from scan_files import WRITERS, Written, nikon, stack
 from nerfcli.ct.circle import Circle, circle_of
 from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.formats.read import read_scan
-from nerfcli.ct.formats.scan_options import ScanOptions
+from nerfcli.ct.formats.statement import ScanOptions
 from nerfcli.ct.geometry import ScanGeometry
+from nerfcli.ct.grid import load_truth
 from nerfcli.ct.recognise import recognise
 from nerfcli.ct.scan import load_scan
-from nerfcli.ct.truth import load_truth
 
 
 def differences(one: Circle, other: Circle) -> dict[str, float]:

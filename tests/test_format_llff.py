@@ -11,8 +11,8 @@ from captures import CAMERAS, reprojection_px, ring
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.capture import Capture, Observations
+from nerfcli.captures.formats.fields import array_of_npy
 from nerfcli.captures.formats.llff import losses_llff, parse_llff, write_llff
-from nerfcli.captures.formats.npy import array_of_npy
 from nerfcli.errors import UserError
 
 

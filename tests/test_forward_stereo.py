@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from test_stereo import LENS, NORMALS, PINHOLE, found, photo, truth
 
 from nerfcli.cameras.rigid import rotation_from_vector
-from nerfcli.matching import forward_stereo
-from nerfcli.matching.forward_stereo import forward_depths
+from nerfcli.matching import pair_stereo
+from nerfcli.matching.pair_stereo import forward_depths
 from nerfcli.matching.stereo_view import view_of
 from nerfcli.photos.loading import LoadedPhoto
 
@@ -95,7 +95,7 @@ def test_views_in_opposite_directions_are_left_alone():
 def test_axes_are_a_rotation_along_the_baseline(vector, seed):
     axis = np.random.default_rng(seed).normal(size=3)
     axis = np.eye(3)[seed] if seed < 3 else axis / np.linalg.norm(axis)
-    axes = forward_stereo._axes(axis, rotation_from_vector(np.array(vector)))
+    axes = pair_stereo._axes(axis, rotation_from_vector(np.array(vector)))
     assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-9)
     assert np.linalg.det(axes) == pytest.approx(1.0)
     assert axes[2] == pytest.approx(axis)
@@ -103,12 +103,12 @@ def test_axes_are_a_rotation_along_the_baseline(vector, seed):
 
 def test_points_at_twice_the_distance_of_the_second_camera_are_shifted_by_the_logarithm_of_two():
     points = np.array([[0.5, 0.3, 2.0]] * 20)
-    assert forward_stereo._range(points, 1.0) == pytest.approx((0.85 * np.log(2.0), 1.15 * np.log(2.0)))
-    assert forward_stereo._range(points, -2.0) == pytest.approx((0.85 * np.log(2.0), 1.15 * np.log(2.0)))
-    assert forward_stereo._range(points, 1.99) is None  # magnified 200 times
-    assert forward_stereo._range(points, 3.0) is None  # behind the second camera
+    assert pair_stereo._range(points, 1.0) == pytest.approx((0.85 * np.log(2.0), 1.15 * np.log(2.0)))
+    assert pair_stereo._range(points, -2.0) == pytest.approx((0.85 * np.log(2.0), 1.15 * np.log(2.0)))
+    assert pair_stereo._range(points, 1.99) is None  # magnified 200 times
+    assert pair_stereo._range(points, 3.0) is None  # behind the second camera
     near = np.concatenate([points, np.array([[0.1, 0.1, 1.1]] * 20)])  # magnified 11 times
-    assert forward_stereo._range(near, 1.0) == (0.0, pytest.approx(np.log(forward_stereo.MOST_MAGNIFICATION)))
+    assert pair_stereo._range(near, 1.0) == (0.0, pytest.approx(np.log(pair_stereo.MOST_MAGNIFICATION)))
 
 
 def test_nothing_is_sampled_from_behind_a_view():
@@ -116,6 +116,6 @@ def test_nothing_is_sampled_from_behind_a_view():
     one = photo(0.0, turned=np.radians(80.0))
     view = view_of(replace(one, pixels=np.full_like(one.pixels, 200)), 200)
     phi = np.linspace(-np.pi, np.pi, 90, dtype=np.float32)
-    sampled = forward_stereo._sampled(view, np.eye(3), np.log(np.array([3.7], np.float32)), phi)
+    sampled = pair_stereo._sampled(view, np.eye(3), np.log(np.array([3.7], np.float32)), phi)
     assert np.all(sampled[np.abs(phi) < 0.3] == 200)
     assert not sampled[np.abs(phi) > np.pi / 2].any()

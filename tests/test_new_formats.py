@@ -16,7 +16,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.registry import recognise
-from nerfcli.captures.formats.timed_poses import poses_at
+from nerfcli.captures.formats.trajectories import poses_at
 from nerfcli.errors import BAD_INPUT, UserError
 
 NAMES = (

@@ -27,7 +27,7 @@ from nerfcli.cameras.conventions import opengl_from_opencv_pose
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import write_colmap_binary, write_colmap_text
 from nerfcli.captures.formats.format import UserInputs
-from nerfcli.captures.formats.lens_fits import Fits, Terms
+from nerfcli.captures.formats.lenses import Fits, Terms
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.errors import BAD_INPUT, UserError

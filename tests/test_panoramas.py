@@ -22,8 +22,8 @@ from nerfcli.captures.loading import load_scene
 from nerfcli.doctor.compared_pairs import compare
 from nerfcli.doctor.photo_facts import Source, read_all
 from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
-from nerfcli.matching.panorama_faces import FACES, Faces
 from nerfcli.matching.stereo import dense_depths
+from nerfcli.matching.stereo_view import FACES, Faces
 from nerfcli.matching.tracks import Tracks
 from nerfcli.output import Output
 from nerfcli.photos.images import read_image

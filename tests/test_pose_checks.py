@@ -30,7 +30,7 @@ from nerfcli.poses import structure_from_motion
 from nerfcli.poses.engine import worker
 from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.mapping import mapping_key, read_mapped, write_mapped
-from nerfcli.poses.engine.result import describe_components, replace_non_finite
+from nerfcli.poses.engine.worker import describe_components, replace_non_finite
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.judge import acceptance, examine

@@ -26,8 +26,8 @@ import nerfcli
 from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.machine import default_memory_limit, resident_bytes
 from nerfcli.poses import structure_from_motion
+from nerfcli.poses.input.job import read_stage, write_stage
 from nerfcli.poses.input.settings import PoseSettings
-from nerfcli.poses.input.stages import read_stage, write_stage
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.structure_from_motion import estimate_poses, plan_poses
 from nerfcli.poses.workspace import database_bytes, is_same_scene, workspace

@@ -21,10 +21,7 @@ from nerfcli.cameras.alignment import align, align_robustly
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.colmap import write_colmap_binary
-from nerfcli.captures.loading import load_scene
-from nerfcli.captures.scale.boards import (
+from nerfcli.captures.boards import (
     CharucoBoard,
     Side,
     nearest_in_pixels,
@@ -33,12 +30,20 @@ from nerfcli.captures.scale.boards import (
     scale_from_corners,
     scale_from_markers,
 )
-from nerfcli.captures.scale.distances import KnownDistance, known_distance, scale_from_distances
-from nerfcli.captures.scale.estimate import ScaleEstimate
-from nerfcli.captures.scale.gps import gps_positions, scale_from_gps
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.colmap import write_colmap_binary
+from nerfcli.captures.loading import load_scene
+from nerfcli.captures.scale import (
+    KnownDistance,
+    ScaleEstimate,
+    gps_positions,
+    known_distance,
+    scale_from_distances,
+    scale_from_gps,
+)
 from nerfcli.captures.world import transformed
 from nerfcli.errors import UserError
-from nerfcli.photos.geodesy import Position, east_north_up, ecef
+from nerfcli.photos.exif import Position, east_north_up, ecef
 from nerfcli.photos.images import write_png
 
 few = examples(20)

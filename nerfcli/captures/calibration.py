@@ -14,8 +14,7 @@ from nerfcli.captures.formats.fields import read_json_object
 from nerfcli.captures.formats.format import UserInputs, find_json, named
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.captures.formats.scene_folder import MODEL_FOLDER, SCENE_FILE
-from nerfcli.captures.orientation import fit_to_picture
-from nerfcli.captures.stored_pixels import UPRIGHT
+from nerfcli.captures.orientation import UPRIGHT, fit_to_picture
 from nerfcli.errors import UserError
 
 _SIZES_SHOWN = 4

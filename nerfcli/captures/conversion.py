@@ -16,7 +16,7 @@ from nerfcli.captures.axes import Convention, expressed, opencv_from_axes, poses
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.registry import recognise, with_masks
-from nerfcli.captures.stored_pixels import STORED, UPRIGHT, ReorientedCapture, in_pixels
+from nerfcli.captures.orientation import STORED, UPRIGHT, ReorientedCapture, in_pixels
 from nerfcli.errors import GATE_NOT_MET, UserError
 
 TOLERANCE_PX = 1e-6

@@ -16,8 +16,7 @@ from nerfcli.captures.formats import run_cameras
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.captures.holdout import default_split, names_held_out
-from nerfcli.captures.orientation import counted, rescaling
-from nerfcli.captures.stored_pixels import UPRIGHT, measure_of, upright
+from nerfcli.captures.orientation import UPRIGHT, counted, measure_of, rescaling, upright
 from nerfcli.errors import UserError, in_shell
 from nerfcli.photos.masks import masks_inside
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from nerfcli.captures.conversion import ConventionOverrides, TargetOptions
     from nerfcli.captures.detect import Detection, HypothesisScore, Question
     from nerfcli.captures.formats.format import UserInputs
-    from nerfcli.captures.world_frame import WorldFrame
+    from nerfcli.captures.world import WorldFrame
 
 FORMATS_WRITTEN = (
     "nerfcli",
@@ -128,7 +128,7 @@ class WorldOptions:
 
     def frame(self) -> "WorldFrame":
         """Return the frame that the options select."""
-        from nerfcli.captures.world_frame import WorldFrame
+        from nerfcli.captures.world import WorldFrame
 
         return WorldFrame(self.world_up, self.origin, self.scale, self.markers, tuple(self.distance or ()))
 

@@ -15,7 +15,7 @@ from nerfcli.machine import Resources
 from nerfcli.pages.findings import VERDICTS, Finding
 
 if TYPE_CHECKING:
-    from nerfcli.ct.checks.examine import ScanDiagnosis
+    from nerfcli.ct.examine import ScanDiagnosis
     from nerfcli.doctor.examination import Diagnosis
 
 GATES = ("good", "look")

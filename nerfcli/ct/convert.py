@@ -5,7 +5,7 @@ from typing import Any
 
 from nerfcli.ct.describe import facts_of, in_words
 from nerfcli.ct.formats.read import read_scan
-from nerfcli.ct.formats.scan_options import ScanOptions
+from nerfcli.ct.formats.statement import ScanOptions
 from nerfcli.ct.recognise import is_scan
 from nerfcli.ct.scan import load_scan, save_scan
 from nerfcli.errors import UserError

@@ -14,7 +14,7 @@ from nerfcli.ct.centre import FEWEST_VIEWS, SIGNIFICANT, centre_of, margin
 from nerfcli.ct.describe import in_words
 from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.formats.read import read_scan
-from nerfcli.ct.formats.scan_options import ScanOptions
+from nerfcli.ct.formats.statement import ScanOptions
 from nerfcli.ct.quick import highest_contrast_row
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError

@@ -12,10 +12,8 @@ import cv2
 import numpy as np
 
 from nerfcli.cameras.rigid import apply, inverse
-from nerfcli.matching.forward_stereo import forward_depths
-from nerfcli.matching.panorama_faces import FACES, Faces
-from nerfcli.matching.sideways_stereo import sideways_depths
-from nerfcli.matching.stereo_view import BLOCK_PX, FEWEST_SHARED, View, seen_by, view_of
+from nerfcli.matching.pair_stereo import forward_depths, sideways_depths
+from nerfcli.matching.stereo_view import BLOCK_PX, FACES, FEWEST_SHARED, Faces, View, seen_by, view_of
 from nerfcli.matching.tracks import LEAST_ANGLE_RAD, MOST_POINTS, SAME_SIDE_COS, Tracks, triangulate
 from nerfcli.photos.loading import LoadedPhoto
 

@@ -36,6 +36,23 @@ class Finding:
         return tuple(name for name, _ in self.photos)
 
 
+def finding(
+    check: str,
+    verdict: str,
+    summary: str,
+    number: float | None,
+    threshold: str,
+    *,
+    advice: str,
+    photos: Iterable[tuple[str, str]] = (),
+) -> Finding:
+    """Return the finding of a check, which has advice and names photos only where its verdict is not good."""
+    is_good = verdict == GOOD
+    return Finding(
+        check, verdict, summary, number, threshold, "" if is_good else advice, () if is_good else tuple(photos)
+    )
+
+
 def verdict_above(number: float, *, look: float, bad: float) -> str:
     """Return the verdict on a number that should be small: look from `look` on, bad from `bad` on."""
     return BAD if number >= bad else LOOK if number >= look else GOOD

@@ -21,9 +21,8 @@ from nerfcli.captures.calibration import Calibration
 from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.errors import UserError
 from nerfcli.photos.images import list_photos, name_in
-from nerfcli.poses.input.job import database_path
+from nerfcli.poses.input.job import database_path, file_key
 from nerfcli.poses.input.settings import PoseSettings
-from nerfcli.poses.input.stages import file_key
 
 _LOCK = "poses.lock"
 # Folder of a model that the checks refused; nothing takes a folder of this name for a scene.

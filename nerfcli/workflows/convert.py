@@ -10,9 +10,8 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.conversion import TOLERANCE_PX, ConventionOverrides, Conversion, TargetOptions, convert, load
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.registry import recognise, recording
-from nerfcli.captures.orientation import describe_rescaling
-from nerfcli.captures.stored_pixels import STORED, in_pixels, other_sizes
-from nerfcli.captures.world_frame import WorldFrame, in_world_frame
+from nerfcli.captures.orientation import STORED, describe_rescaling, in_pixels, other_sizes
+from nerfcli.captures.world import WorldFrame, in_world_frame
 from nerfcli.errors import UserError, listed, several
 from nerfcli.notices import Reporter
 from nerfcli.photos.images import UNUSUAL_SUFFIXES

@@ -25,8 +25,7 @@ from nerfcli.captures.formats.transforms import (
     relative_path,
 )
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
-from nerfcli.captures.orientation import Measure
-from nerfcli.captures.stored_pixels import measure
+from nerfcli.captures.orientation import Measure, measure
 from nerfcli.errors import UserError
 
 

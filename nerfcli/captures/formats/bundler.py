@@ -23,8 +23,7 @@ from nerfcli.captures.formats.fields import check_unique_names, content_lines, m
 from nerfcli.captures.formats.format import Format, by_suffix, only_file
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
-from nerfcli.captures.orientation import Measure, stored_size
-from nerfcli.captures.stored_pixels import measure
+from nerfcli.captures.orientation import Measure, measure, stored_size
 
 BEGINS = "# Bundle file"
 _HEADER = f"{BEGINS} v0.3"

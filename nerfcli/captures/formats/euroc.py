@@ -32,7 +32,7 @@ from nerfcli.captures.formats.fields import (
 from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.limits import FramePoses, rigid_pose
 from nerfcli.captures.formats.photo_names import with_photos
-from nerfcli.captures.formats.timed_poses import photos_at
+from nerfcli.captures.formats.trajectories import photos_at
 from nerfcli.errors import several
 
 HOME, TRUTH = "mav0", "state_groundtruth_estimate0"

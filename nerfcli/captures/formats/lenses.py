@@ -1,10 +1,25 @@
 """Convert lenses as other programs describe them to COLMAP's camera models, with as few parameters as needed.
 
 Notation: focal lengths fx, fy and principal point cx, cy in pixels; k radial, p tangential, in OpenCV's order.
+
+Calibrations of other programs have terms that no lens here has: skew, a fourth radial term, or tangential terms that
+grow with the radius. Mostly they move no pixel by a tenth of its width once the other terms are fitted to them; if they
+do, the lens is refused.
 """
 
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.distortion import Distortion
+from nerfcli.cameras.frame import Size
+from nerfcli.cameras.lens import Lens
+from nerfcli.cameras.projections import Equidistant, Perspective
+from nerfcli.captures.formats.fields import malformed
 from nerfcli.captures.formats.limits import checked_camera
+from nerfcli.errors import listed, several
 
 Pair = tuple[float, float]
 
@@ -77,3 +92,178 @@ def spherical_camera(size: tuple[int, int], where: str) -> Camera:
         UserError: the picture is not twice as wide as high, so it cannot show the whole sphere.
     """
     return checked_camera("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), where=where)
+
+
+# The largest distance of a pixel that is accepted.
+MOST_OFF_PX = 0.1
+# A fit that is better is not improved by further terms.
+_GOOD_PX = 0.01
+# Skew counts as rounding if it shifts the bottom of the picture by at most this much against its top.
+_NEGLIGIBLE_SKEW_PX = 0.02
+_STEPS = 40
+
+
+class Terms(NamedTuple):
+    """The terms of a lens. With x', y' as in `brown_camera` or `fisheye_camera`, and tx, ty their tangential part:
+
+        u = fx (x' + tx (p3 r^2 + p4 r^4)) + skew y' + cx,  v = fy (y' + ty (p3 r^2 + p4 r^4)) + cy
+
+    Args:
+        radial: k1 to k4.
+        tangential: p1 and p2 in OpenCV's order.
+        growth: p3 and p4 of Metashape before version 1.6.
+        skew: in pixels.
+        skew_name: its name in the file.
+    """
+
+    radial: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    tangential: Pair = (0.0, 0.0)
+    growth: Pair = (0.0, 0.0)
+    skew: float = 0.0
+    skew_name: str = "skew"
+
+    @property
+    def beyond_fisheye(self) -> dict[str, float]:
+        """The terms other than 0 that no fisheye here has, by name."""
+        terms = {self.skew_name: self.skew, "p3": self.growth[0], "p4": self.growth[1]}
+        return {name: value for name, value in terms.items() if value}
+
+    @property
+    def beyond_brown(self) -> dict[str, float]:
+        """The terms other than 0 that no perspective lens here has, by name."""
+        k4 = self.radial[3]
+        return ({"k4": k4} if k4 else {}) | self.beyond_fisheye
+
+
+class Fits:
+    """Makes the cameras of a capture, and remembers how well their terms were fitted by others."""
+
+    def __init__(self) -> None:
+        self._off: dict[tuple[str, str], list[float]] = {}
+
+    def brown(self, size: Size, focal: Pair, centre: Pair, *, terms: Terms, where: str) -> Camera:
+        """Return the perspective camera with these terms, or the one that fits them best.
+
+        Raises:
+            UserError: the best fit is off by more than `MOST_OFF_PX`; the terms and `where` are named.
+        """
+        k1, k2, k3, _ = terms.radial
+        plain = brown_camera(size, focal, centre, radial=(k1, k2, k3), tangential=terms.tangential, where=where)
+        if not terms.beyond_brown:
+            return plain
+        p1, p2 = terms.tangential
+        start = checked_camera("FULL_OPENCV", *size, (*focal, *centre, k1, k2, p1, p2, k3, 0, 0, 0), where=where)
+        return self._accepted(_best(plain, start, terms), terms.beyond_brown, where)
+
+    def fisheye(self, size: Size, focal: Pair, centre: Pair, *, terms: Terms, where: str) -> Camera:
+        """Return the equidistant camera with these terms, or the one that fits them best; errors as of `brown`."""
+        radial, tangential = terms.radial, terms.tangential
+        plain = fisheye_camera(size, focal, centre, radial=radial, tangential=tangential, where=where)
+        if not terms.beyond_fisheye:
+            return plain
+        params = (*focal, *centre, *radial[:2], *tangential, *radial[2:], 0, 0)
+        start = checked_camera("THIN_PRISM_FISHEYE", *size, params, where=where)
+        return self._accepted(_best(plain, start, terms), terms.beyond_fisheye, where)
+
+    def matrix(self, matrix: np.ndarray, size: Size, where: str) -> Camera:
+        """Return the perspective camera of a matrix (3, 3) of intrinsics: fx, s, cx; 0, fy, cy; 0, 0, 1.
+
+        Raises:
+            UserError: the matrix is not of this form, a number is invalid, or see `brown`; `where` is named.
+        """
+        (fx, skew, cx), (lower, fy, cy), last = matrix.tolist()
+        if lower != 0 or last != [0, 0, 1]:
+            raise malformed(where, "is not a matrix of intrinsics", "expected the rows fx 0 cx, 0 fy cy, 0 0 1")
+        matters = not abs(skew) * size[1] <= _NEGLIGIBLE_SKEW_PX * abs(fy)
+        return self.brown(size, (fx, fy), (cx, cy), terms=Terms(skew=skew if matters else 0.0), where=where)
+
+    def notes(self) -> tuple[str, ...]:
+        """Return what was fitted and how far it is off, for people."""
+        return tuple(
+            f"{terms} of {several(len(off), 'camera')}, which {model} does not have: at most {max(off):.2g} px off"
+            for (terms, model), off in self._off.items()
+        )
+
+    def _accepted(self, fitted: tuple[Camera, float], lost: dict[str, float], where: str) -> Camera:
+        camera, off_px = fitted
+        if not off_px <= MOST_OFF_PX:
+            values = ", ".join(f"{name} is {value:g}" for name, value in lost.items())
+            raise malformed(
+                where,
+                f"{values}, which no supported lens has, and the nearest one is off by {off_px:.2g} px",
+                f"at most {MOST_OFF_PX:g} px is accepted; undistort the photos, or calibrate again without this term",
+            )
+        found = self._off.setdefault((listed(list(lost)), camera.model), [])
+        if off_px not in found:
+            found.append(off_px)
+        return camera
+
+
+@lru_cache(maxsize=1024)
+def _best(plain: Camera, start: Camera, terms: Terms) -> tuple[Camera, float]:
+    """Return the camera whose pixels are nearest to those of the terms, and the largest distance of a pixel.
+
+    It is `plain` if that is good, else `start` with other distortion terms, by least squares over the picture: first
+    the polynomial, then, of a perspective lens, its divisor, too.
+    """
+    directions, truth = _true_pixels(plain, terms)
+    best, least = plain, _off_px(plain, directions, truth)
+    camera = start
+    for last in (9, 12):
+        if least > _GOOD_PX and last <= len(start.params):
+            camera = _fitted(camera, last, directions, truth)
+            off_px = _off_px(camera, directions, truth)
+            if off_px < 0.9 * least:
+                best, least = camera, off_px
+    return best, least
+
+
+def _fitted(camera: Camera, last: int, directions: np.ndarray, truth: np.ndarray) -> Camera:
+    """Return the camera with its parameters from the fifth to the `last` by least squares (Levenberg-Marquardt)."""
+    error, damping = _squares(camera, directions, truth), 1e-6
+    for _ in range(_STEPS):
+        pixels, _ = camera.project(directions)
+        _, by_parameters, seen = camera.project_jacobian(directions)
+        columns = by_parameters[seen][:, :, 4:last].reshape(2 * seen.sum(), -1)
+        lengths = np.linalg.norm(columns, axis=0)
+        lengths[lengths == 0] = 1.0
+        normal, goal = (columns / lengths).T, (truth - pixels)[seen].ravel()
+        step = np.linalg.solve(normal @ normal.T + damping * np.eye(len(normal)), normal @ goal) / lengths
+        values = (*camera.params[:4], *(np.array(camera.params[4:last]) + step).tolist(), *camera.params[last:])
+        moved = Camera(camera.model, *camera.size, values)
+        squares = _squares(moved, directions, truth)
+        damping *= 10.0 if squares > error else 0.1
+        if squares <= error:
+            camera, error = moved, squares
+    return camera
+
+
+def _true_pixels(plain: Camera, terms: Terms) -> tuple[np.ndarray, np.ndarray]:
+    """Return directions (N, 3) over the picture, with its edges, and the pixels (N, 2) where the terms show them."""
+    projection = Equidistant() if plain.model.endswith("FISHEYE") else Perspective()
+    p1, p2 = terms.tangential
+    distortion = Distortion(radial=terms.radial, tangential=(p2, p1))
+    focal, centre = np.array(plain.focal_lengths)[:, None], np.array(plain.principal_point)[:, None]
+    steps = [np.linspace(0.0, side, count) for side, count in zip(plain.size, (33, 25), strict=True)]
+    grid = np.stack(np.meshgrid(*steps)).reshape(2, -1)
+    directions, valid = Lens(projection, (distortion,), focal, centre, np.zeros((0, 0))).unproject(grid)
+    plane = projection.plane(directions[:, valid])
+    square = (plane**2).sum(axis=0)
+    moved = distortion.apply(plane)
+    tangential = Distortion(tangential=(p2, p1)).apply(plane) - plane
+    moved += tangential * (terms.growth[0] * square + terms.growth[1] * square**2)
+    pixels = moved * focal + centre
+    pixels[0] += terms.skew * moved[1]
+    return directions[:, valid].T, pixels.T
+
+
+def _squares(camera: Camera, directions: np.ndarray, truth: np.ndarray) -> float:
+    """Return the sum of the squared distances of pixels from the true ones; infinite if one has no pixel."""
+    pixels, seen = camera.project(directions)
+    return float(((pixels - truth) ** 2).sum()) if seen.all() else np.inf
+
+
+def _off_px(camera: Camera, directions: np.ndarray, truth: np.ndarray) -> float:
+    """Return the largest distance of the pixels of directions from the true ones; infinite if one has no pixel."""
+    pixels, seen = camera.project(directions)
+    return float(np.linalg.norm(pixels - truth, axis=1).max()) if len(seen) and seen.all() else np.inf

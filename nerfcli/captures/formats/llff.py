@@ -18,9 +18,9 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.fields import DAMAGED, array_of_npy
 from nerfcli.captures.formats.format import Format, folder_with
 from nerfcli.captures.formats.limits import FramePoses, checked_camera, plausible
-from nerfcli.captures.formats.npy import DAMAGED, array_of_npy
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
 from nerfcli.errors import UserError
 from nerfcli.photos.images import list_images

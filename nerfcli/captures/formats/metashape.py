@@ -35,8 +35,7 @@ from nerfcli.captures.formats.fields import (
     size_of,
 )
 from nerfcli.captures.formats.format import Format, by_suffix
-from nerfcli.captures.formats.lens_fits import Fits, Terms
-from nerfcli.captures.formats.lenses import spherical_camera
+from nerfcli.captures.formats.lenses import Fits, Terms, spherical_camera
 from nerfcli.captures.formats.limits import FramePoses, rigid_pose
 from nerfcli.captures.formats.photo_names import with_photos
 from nerfcli.errors import listed as in_words

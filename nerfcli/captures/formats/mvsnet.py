@@ -20,11 +20,10 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, malformed, matrix_of, numbers, read_text
 from nerfcli.captures.formats.format import Format
-from nerfcli.captures.formats.lens_fits import Fits
+from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
-from nerfcli.captures.orientation import stored_size
-from nerfcli.captures.stored_pixels import measure
+from nerfcli.captures.orientation import measure, stored_size
 
 CAMERA_FOLDER = "cams"
 CAMERA_FILES = "*_cam.txt"

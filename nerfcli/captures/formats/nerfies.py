@@ -20,6 +20,8 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import (
+    DAMAGED,
+    array_of_npy,
     check_unique_names,
     malformed,
     matrix,
@@ -31,7 +33,6 @@ from nerfcli.captures.formats.fields import (
 )
 from nerfcli.captures.formats.format import Format, has_keys
 from nerfcli.captures.formats.limits import FramePoses, plausible, without
-from nerfcli.captures.formats.npy import DAMAGED, array_of_npy
 from nerfcli.captures.formats.photo_names import find_photos
 
 CAMERAS, DATASET = "camera", "dataset.json"

@@ -16,14 +16,12 @@ from scipy.linalg import rq
 from nerfcli.cameras import rigid
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import malformed
+from nerfcli.captures.formats.fields import DAMAGED, array_of_npy, malformed, members_of_npz
 from nerfcli.captures.formats.format import Format, named
-from nerfcli.captures.formats.lens_fits import Fits
+from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import plausible
-from nerfcli.captures.formats.npy import DAMAGED, array_of_npy, members_of_npz
 from nerfcli.captures.formats.photo_names import GIVE_PHOTOS
-from nerfcli.captures.orientation import stored_size
-from nerfcli.captures.stored_pixels import measure
+from nerfcli.captures.orientation import measure, stored_size
 from nerfcli.errors import UserError
 from nerfcli.photos.images import list_images
 

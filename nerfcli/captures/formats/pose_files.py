@@ -31,11 +31,10 @@ from nerfcli.captures.formats.fields import (
     size_of,
 )
 from nerfcli.captures.formats.format import Format
-from nerfcli.captures.formats.lens_fits import Fits
+from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses, checked_camera
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, FoundPhotos, find_photos
-from nerfcli.captures.orientation import stored_size
-from nerfcli.captures.stored_pixels import measure
+from nerfcli.captures.orientation import measure, stored_size
 from nerfcli.errors import UserError
 
 POSE_FOLDERS = ("pose", "poses")

@@ -19,11 +19,10 @@ from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed, read_json_object, vector
 from nerfcli.captures.formats.format import Format, has_keys
-from nerfcli.captures.formats.lens_fits import Fits
+from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
-from nerfcli.captures.orientation import stored_size
-from nerfcli.captures.stored_pixels import measure
+from nerfcli.captures.orientation import measure, stored_size
 
 _POSE = "cameraPoseARFrame"
 _FRAME = re.compile(r"frame_\d+\.json", re.IGNORECASE | re.ASCII)

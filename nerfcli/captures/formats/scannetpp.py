@@ -15,7 +15,7 @@ from nerfcli.captures.formats.fields import check_unique_names, malformed, read_
 from nerfcli.captures.formats.format import Format, has_keys
 from nerfcli.captures.formats.photo_search import plain_name
 from nerfcli.captures.formats.transforms import listed_frames, records_of
-from nerfcli.captures.stored_pixels import measure
+from nerfcli.captures.orientation import measure
 from nerfcli.errors import several
 
 FILES = ("transforms.json", "transforms_undistorted.json")

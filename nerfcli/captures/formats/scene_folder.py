@@ -20,7 +20,7 @@ from nerfcli.captures.formats.fields import read_json_object
 from nerfcli.captures.formats.format import Format, folder_with
 from nerfcli.captures.formats.photo_names import seen_from, with_photos
 from nerfcli.captures.holdout import default_split
-from nerfcli.captures.stored_pixels import UPRIGHT
+from nerfcli.captures.orientation import UPRIGHT
 from nerfcli.errors import UserError, in_shell
 from nerfcli.photos.masks import find_mask
 from nerfcli.version import __version__

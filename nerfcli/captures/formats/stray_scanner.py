@@ -17,11 +17,10 @@ from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, malformed, numbers, read_rows
 from nerfcli.captures.formats.format import Format, folder_with
-from nerfcli.captures.formats.lens_fits import Fits
+from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import GIVE_PHOTOS, FoundPhotos, find_photos
-from nerfcli.captures.orientation import stored_size
-from nerfcli.captures.stored_pixels import measure
+from nerfcli.captures.orientation import measure, stored_size
 from nerfcli.errors import several
 from nerfcli.photos.video import open_video
 

@@ -21,7 +21,7 @@ from nerfcli.captures.formats.alicevision import find_alicevision
 from nerfcli.captures.formats.camera_path import find_camera_path
 from nerfcli.captures.formats.fields import check_unique_names, malformed, matrix, read_json_object
 from nerfcli.captures.formats.format import Format, find_json
-from nerfcli.captures.formats.lens_fits import Fits
+from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos, seen_from
 from nerfcli.captures.formats.photo_search import plain_name
@@ -35,8 +35,7 @@ from nerfcli.captures.formats.transforms_cameras import (
     record_of_camera,
 )
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts
-from nerfcli.captures.orientation import Measure, stored_size
-from nerfcli.captures.stored_pixels import measure
+from nerfcli.captures.orientation import Measure, measure, stored_size
 from nerfcli.errors import UserError, several
 from nerfcli.errors import listed as in_words
 

@@ -9,7 +9,7 @@ from typing import Any
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.formats import fields, lenses
 from nerfcli.captures.formats.fields import malformed
-from nerfcli.captures.formats.lens_fits import Fits, Terms
+from nerfcli.captures.formats.lenses import Fits, Terms
 from nerfcli.captures.formats.limits import checked_camera
 from nerfcli.captures.formats.unsupported import distortion, projection
 

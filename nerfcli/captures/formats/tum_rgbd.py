@@ -20,10 +20,8 @@ from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import check_unique_names, name_of, numbers, read_text
 from nerfcli.captures.formats.format import Format, folder_with
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, find_photos
-from nerfcli.captures.formats.timed_poses import MOST_AWAY_SECONDS, photos_at
-from nerfcli.captures.formats.trajectories import timed_rows, tum_poses
-from nerfcli.captures.orientation import stored_size
-from nerfcli.captures.stored_pixels import measure
+from nerfcli.captures.formats.trajectories import MOST_AWAY_SECONDS, photos_at, timed_rows, tum_poses
+from nerfcli.captures.orientation import measure, stored_size
 from nerfcli.errors import UserError
 
 PHOTOS, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"

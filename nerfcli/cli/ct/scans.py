@@ -20,7 +20,7 @@ from nerfcli.output import Output
 
 if TYPE_CHECKING:
     from nerfcli.ct.detect import Judgement
-    from nerfcli.ct.formats.scan_options import ScanOptions
+    from nerfcli.ct.formats.statement import ScanOptions
     from nerfcli.ct.result import ReconstructionSettings
 
 
@@ -52,7 +52,7 @@ class ScanStatements:
         Raises:
             typer.BadParameter: the rule for held-out views cannot be parsed.
         """
-        from nerfcli.ct.formats.scan_options import ScanOptions
+        from nerfcli.ct.formats.statement import ScanOptions
 
         return ScanOptions(self.photons, self.unit, self.centre_of_rotation, holdout_rule(self.holdout), self.mirrored)
 
@@ -168,7 +168,7 @@ def doctor(
     console = printing.console
 
     def work(given: Given) -> None:
-        from nerfcli.ct.checks.examine import examine
+        from nerfcli.ct.examine import examine
 
         page = writing.beside(given, "-doctor.html")
         with console.stage(f"doctor {given.path.name}") as reporter:

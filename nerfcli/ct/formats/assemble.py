@@ -9,7 +9,7 @@ import numpy as np
 
 from nerfcli.captures.holdout import names_held_out
 from nerfcli.ct.circle import Circle
-from nerfcli.ct.formats.scan_options import MILLIMETRES, ScanOptions, check_pixel_size
+from nerfcli.ct.formats.statement import MILLIMETRES, ScanOptions, check_pixel_size
 from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.open_beam import OpenBeam
 from nerfcli.ct.scan import Kind, Scan, held_out_views

@@ -11,7 +11,7 @@ import numpy as np
 
 from nerfcli.ct.circle import Circle
 from nerfcli.ct.formats.assemble import ReaderOutput, scan_of
-from nerfcli.ct.formats.scan_options import ScanOptions, angles_in_radians, millimetres
+from nerfcli.ct.formats.statement import ScanOptions, angles_in_radians, millimetres
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
 

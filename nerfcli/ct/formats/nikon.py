@@ -13,8 +13,7 @@ import numpy as np
 from nerfcli.ct.circle import Circle
 from nerfcli.ct.formats.assemble import ReaderOutput, scan_of
 from nerfcli.ct.formats.pictures import numbered, read_stack
-from nerfcli.ct.formats.scan_options import ScanOptions, angles_in_radians
-from nerfcli.ct.formats.statement import Statement, read_lines
+from nerfcli.ct.formats.statement import ScanOptions, Statement, angles_in_radians, read_lines
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
 

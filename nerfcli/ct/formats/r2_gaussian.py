@@ -12,11 +12,10 @@ import numpy as np
 
 from nerfcli.ct.circle import Circle
 from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
-from nerfcli.ct.formats.scan_options import ScanOptions, angles_in_radians
-from nerfcli.ct.formats.statement import Statement, read_object
+from nerfcli.ct.formats.statement import ScanOptions, Statement, angles_in_radians, read_object
+from nerfcli.ct.grid import described_truth
 from nerfcli.ct.recognise import R2_GAUSSIAN
 from nerfcli.ct.scan import Scan
-from nerfcli.ct.truth import described_truth
 from nerfcli.errors import UserError
 
 _HINT = "expected R2-Gaussian's meta_data.json: scanner, proj_train and proj_test"

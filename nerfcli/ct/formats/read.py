@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from nerfcli.ct.formats import hdf5, heltomo, nikon, r2_gaussian, skyscan, stated_stack, transmission_transforms
-from nerfcli.ct.formats.scan_options import ScanOptions
+from nerfcli.ct.formats.statement import ScanOptions
 from nerfcli.ct.recognise import OWN, files_of, recognise
 from nerfcli.ct.scan import Scan, load_scan
 from nerfcli.errors import UserError

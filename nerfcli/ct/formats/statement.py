@@ -1,14 +1,113 @@
-"""Descriptions in text files: "key = value" lines of scanners, and JSON; errors name the missing or invalid field."""
+"""Descriptions of scans: the user's options, units, and fields of text files, as "key = value" lines or JSON."""
 
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from nerfcli.errors import UserError
+
+# Millimetres per unit of length, keyed by the names of units in files.
+MILLIMETRES = {
+    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1e3),
+    **dict.fromkeys(("cm", "centimetre", "centimeter"), 10.0),
+    **dict.fromkeys(("mm", "millimetre", "millimetres", "millimeter", "millimeters"), 1.0),
+    **dict.fromkeys(("um", "µm", "μm", "micron", "microns", "micrometre", "micrometer", "micrometers"), 1e-3),
+    **dict.fromkeys(("nm", "nanometre", "nanometer"), 1e-6),
+}
+# Range of plausible pixel sides in mm; outside of it, the unit must be wrong.
+PIXEL_MM = (1e-6, 20.0)
+_DEGREES = ("deg", "degree", "degrees", "°", "degs")
+_RADIANS = ("rad", "radian", "radians")
+# Angles said to be in degrees that span less than this over many views are in radians.
+_NARROW_DEG, _MANY_VIEWS = 6.5, 30
+
+
+@dataclass(frozen=True)
+class ScanOptions:
+    """The user's options.
+
+    Args:
+        photons: number of photons per pixel of the open beam in a view.
+        unit: unit of lengths in the file, a key of `MILLIMETRES`; overrides the unit that the file states.
+        centre_column: the column that the axis of rotation is projected to, 0 for the middle of the first pixel.
+        holdout: a rule of `holdout.check_holdout` for views, which are named 00000, 00001, ...
+        mirrored: whether columns are numbered from the side opposite to the one that the file states.
+    """
+
+    photons: float | None = None
+    unit: str | None = None
+    centre_column: float | None = None
+    holdout: str | None = None
+    mirrored: bool = False
+
+
+def millimetres(unit: str, *, where: str) -> float:
+    """Return the length of a unit in millimetres.
+
+    Raises:
+        UserError: it is not a unit of length.
+    """
+    found = MILLIMETRES.get(unit.strip().lower())
+    if found is None:
+        raise UserError(f"{where}: {unit!r} is not a unit of length", "set it with --unit: m, mm, um or nm")
+    return found
+
+
+def angles_in_radians(angles: np.ndarray, *, views: int, unit: str | None, where: str) -> np.ndarray:
+    """Convert angles of views to radians.
+
+    Args:
+        angles: (V,).
+        views: expected number of angles.
+        unit: unit as written in the file; None, for no unit, means degrees.
+        where: the place in the file, for error messages.
+
+    Raises:
+        UserError: there are too few or too many, some are not finite, all are the same, or the unit cannot be right.
+    """
+    values = np.asarray(angles, dtype=np.float64).reshape(-1)
+    if len(values) != views:
+        raise UserError(
+            f"{where} has {len(values)} angles for {views} projections",
+            "each projection needs one angle: remove the frames or angles without a counterpart",
+        )
+    if not np.isfinite(values).all():
+        bad = int(np.argmin(np.isfinite(values)))
+        raise UserError(f"{where}: angle {bad} is {values[bad]}", "correct the angles in the file")
+    span = float(np.ptp(values))
+    if span == 0 and views > 1:
+        raise UserError(f"{where}: all {views} angles are {values[0]:g}", "give the angle of each projection")
+    name = "degrees" if unit is None else unit.strip().lower()
+    if name in _RADIANS:
+        if span > 8 * np.pi:
+            raise UserError(f"{where}: angles span {span:.4g} radians", "these look like degrees: correct their unit")
+        return values
+    if name not in _DEGREES:
+        raise UserError(f"{where}: {unit!r} is not a unit of angle", "write degrees or radians")
+    if span < _NARROW_DEG and views >= _MANY_VIEWS:
+        raise UserError(
+            f"{where}: {views} angles span {span:.4g} degrees",
+            "these look like radians: correct their unit in the file",
+        )
+    return np.radians(values)
+
+
+def check_pixel_size(size_mm: float, *, where: str) -> None:
+    """Raise if the pixel size is impossible for a detector.
+
+    Raises:
+        UserError: the size is not positive, or its unit cannot be right.
+    """
+    if not np.isfinite(size_mm) or not PIXEL_MM[0] <= size_mm <= PIXEL_MM[1]:
+        raise UserError(
+            f"{where}: a pixel of {size_mm:g} mm",
+            f"between {PIXEL_MM[0]:g} and {PIXEL_MM[1]:g} mm are possible; set the unit of lengths with --unit",
+        )
 
 
 class Statement:

@@ -14,12 +14,11 @@ import numpy as np
 from nerfcli.ct.circle import circle_of
 from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
 from nerfcli.ct.formats.pictures import read_stack
-from nerfcli.ct.formats.scan_options import ScanOptions
-from nerfcli.ct.formats.statement import Statement, read_object
+from nerfcli.ct.formats.statement import ScanOptions, Statement, read_object
 from nerfcli.ct.geometry import ScanGeometry
+from nerfcli.ct.grid import described_truth
 from nerfcli.ct.recognise import TRANSFORMS, TRANSFORMS_GEOMETRY
 from nerfcli.ct.scan import Scan
-from nerfcli.ct.truth import described_truth
 from nerfcli.errors import UserError
 
 WHITE = 65535.0

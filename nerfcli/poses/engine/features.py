@@ -12,10 +12,8 @@ import pycolmap
 
 from nerfcli.errors import duration
 from nerfcli.poses.engine.database import clear_matches, forget_features, keep_geometries, register_photos
-from nerfcli.poses.engine.polling import every_second
-from nerfcli.poses.input.job import Job, Report, WorkMask
+from nerfcli.poses.input.job import Job, Report, WorkMask, every_second, read_stage, stage_key, write_stage
 from nerfcli.poses.input.plan import limit_seconds, matching_seconds
-from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
 # Most RANSAC trials to verify a pair; pycolmap's 10,000 take twice as long and verify no further pair of 30 matches.
 _MOST_TRIALS = 2000

@@ -18,10 +18,17 @@ from typing import Any
 import pycolmap
 
 import nerfcli
-from nerfcli.poses.engine.polling import every_second
-from nerfcli.poses.input.job import Job, Report, job_from_json
+from nerfcli.poses.input.job import (
+    Job,
+    Report,
+    every_second,
+    file_key,
+    job_from_json,
+    read_stage,
+    stage_key,
+    write_stage,
+)
 from nerfcli.poses.input.plan import LEAST_LIMIT_SECONDS, limit_seconds, mapping_seconds
-from nerfcli.poses.input.stages import file_key, read_stage, stage_key, write_stage
 from nerfcli.poses.model.reasons import FEW_MATCHES
 
 # Change this whenever the mapper would make other models of the same matches.

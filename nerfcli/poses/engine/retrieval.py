@@ -15,9 +15,8 @@ import numpy as np
 import pycolmap
 
 from nerfcli.poses.engine.features import feature_keys
-from nerfcli.poses.input.job import Job, Report
+from nerfcli.poses.input.job import Job, Report, read_stage, stage_key, write_stage
 from nerfcli.poses.input.pairs import in_blocks, retrieval_feature_count
-from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
 # Ratio of the squared distances to the nearest and the second nearest: 0.8 of the distance, as in pycolmap.
 _RATIO = 0.64

@@ -16,8 +16,7 @@ import pycolmap
 from nerfcli.poses.engine.database import evidence
 from nerfcli.poses.engine.features import extract, match, start_matching
 from nerfcli.poses.engine.retrieval import select_pairs
-from nerfcli.poses.input.job import Job, Report
-from nerfcli.poses.input.stages import stage_key
+from nerfcli.poses.input.job import Job, Report, stage_key
 from nerfcli.poses.model.held_out import MAPPER
 from nerfcli.poses.model.locate import place
 from nerfcli.poses.model.principal_points import LEAST_OBSERVATIONS, camera_of_lens, refine_with_principal_point

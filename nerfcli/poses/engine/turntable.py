@@ -26,9 +26,8 @@ from nerfcli.photos.images import image_size, read_image
 from nerfcli.photos.masks import read_mask
 from nerfcli.poses.engine.features import feature_keys
 from nerfcli.poses.input import still_background as still
-from nerfcli.poses.input.job import Job, Tell, WorkMask
+from nerfcli.poses.input.job import Job, Tell, WorkMask, read_stage, stage_key, write_stage
 from nerfcli.poses.input.layout import write_mask, write_no_mask
-from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
 # Features are searched in photos reduced to this longer side, and so many are kept.
 _SIDE_PX = 1000

@@ -1,12 +1,21 @@
-"""Job of the worker process, stored as a file."""
+"""Job of the worker process, stored as a file, and the files of its completed stages.
 
+A complete stage is a JSON file {"key", "content", "seal"} in the work folder. The key is a hash of everything that the
+content depends on: a stage with another key than the requested one counts as missing. The seal is a hash of the
+content: a stage that is cut off or was changed counts as missing, too.
+"""
+
+import hashlib
 import json
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from nerfcli.atomic import write_json
 from nerfcli.photos.panoramas import PANORAMA
 
 # Called with (stage, done, total) as the work proceeds.
@@ -156,3 +165,55 @@ def _with_tuples(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _with_tuples(item) for key, item in value.items()}
     return tuple(_with_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+def stage_key(*parts: Any) -> str:
+    """Return a hash of plain values: equal for equal values, in every process and on every machine."""
+    text = json.dumps(parts, sort_keys=True, ensure_ascii=False)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def file_key(path: Path) -> str:
+    """Return a hash of a file's content."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+
+
+def write_stage(path: Path, key: str, content: Any) -> None:
+    """Mark a stage as complete. Everything else that belongs to it must be on disk already."""
+    write_json(path, {"key": key, "content": content, "seal": _seal(content)})
+
+
+def read_stage(path: Path, key: str) -> Any | None:
+    """Return the content of the complete stage with this key, None if it is missing or damaged."""
+    if not path.is_file():
+        return None
+    try:
+        stage = json.loads(path.read_bytes())
+    except (ValueError, RecursionError):  # cut off, or not text
+        return None
+    if not isinstance(stage, dict) or stage.get("key") != key or "content" not in stage:
+        return None
+    return stage["content"] if stage.get("seal") == _seal(stage["content"]) else None
+
+
+def _seal(content: Any) -> str:
+    return stage_key(json.loads(json.dumps(content)))  # as read back from a file: keys are strings, tuples are lists
+
+
+@contextmanager
+def every_second(look: Callable[[], object]) -> Iterator[None]:
+    """Call `look` once a second from a thread of its own, until the block ends."""
+    finished = threading.Event()
+
+    def watch() -> None:
+        while not finished.wait(1.0):
+            look()
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    try:
+        yield
+    finally:
+        finished.set()
+        watcher.join()

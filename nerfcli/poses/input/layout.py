@@ -13,9 +13,8 @@ from PIL import Image
 from nerfcli.errors import UserError, listed
 from nerfcli.photos.images import read_image
 from nerfcli.photos.masks import find_mask, read_mask
-from nerfcli.poses.input.job import WorkMask
+from nerfcli.poses.input.job import WorkMask, file_key, read_stage, stage_key, write_stage
 from nerfcli.poses.input.photos import Photo, Photos
-from nerfcli.poses.input.stages import file_key, read_stage, stage_key, write_stage
 
 # Formats that pycolmap reads as we do, if stored upright. For all others (CMYK, 16 bit, alpha, TIFF) it gets JPEGs.
 _PLAIN = {("JPEG", ".jpg"), ("JPEG", ".jpeg"), ("MPO", ".jpg"), ("MPO", ".jpeg"), ("PNG", ".png")}

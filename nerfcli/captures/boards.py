@@ -11,7 +11,7 @@ import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import nearest_to_rays
-from nerfcli.captures.scale.estimate import ScaleEstimate
+from nerfcli.captures.scale import ScaleEstimate
 from nerfcli.errors import UserError, several
 from nerfcli.photos.images import read_image
 

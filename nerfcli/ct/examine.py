@@ -6,96 +6,32 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from skimage.filters import threshold_otsu
 
-from nerfcli.ct.centre import FEWEST_VIEWS, FINE, centre_of
-from nerfcli.ct.checks import values, views
-from nerfcli.ct.checks.sample import Sample, sample_of
+from nerfcli.ct import checks
+from nerfcli.ct.checks import Sample, sample_of
 from nerfcli.ct.describe import in_words
-from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.formats.read import read_scan
-from nerfcli.ct.quick import highest_contrast_row, predicted, reconstructed
 from nerfcli.ct.scan import Scan
 from nerfcli.notices import Progress, Reporter, no_progress
 from nerfcli.output import Output
 from nerfcli.pages import page as pages
-from nerfcli.pages.findings import BAD, GOOD, LOOK, VERDICTS, Finding, as_json, verdict_above, worst
+from nerfcli.pages.findings import VERDICTS, Finding, as_json, worst
 from nerfcli.pages.page import data_uri, jpeg_bytes
-
-CENTRE_LOOK, CENTRE_BAD = 0.3, 1.0
-HARDENING_LOOK, HARDENING_BAD = 0.05, 0.25
-# Below this fraction of explained variance, the object has several materials, whose effect looks like beam hardening.
-ONE_MATERIAL = 0.97
-
-
-def centre(sample: Sample) -> Finding | str:
-    """Estimate the centre of rotation."""
-    scan = sample.scan
-    if scan.geometry.views < FEWEST_VIEWS:
-        return "too few views"
-    row = highest_contrast_row(scan)
-    stated = axis_column(scan.geometry)
-    found = centre_of(row.thinned())
-    column = stated - found.shift
-    number = abs(found.shift) if found.is_off else 0.0
-    verdict = verdict_above(number, look=CENTRE_LOOK, bad=CENTRE_BAD)
-    return Finding(
-        "centre of rotation",
-        verdict,
-        f"axis at column {column:.2f} ± {found.error:.2f}; the scan states {stated:.2f}",
-        abs(found.shift),
-        f"look from {CENTRE_LOOK:g} columns, bad from {CENTRE_BAD:g}, if it predicts other views significantly better",
-        "" if verdict == GOOD else f"convert with --centre-of-rotation {column:.2f}, or let ct train estimate it",
-    )
-
-
-def beam_hardening(sample: Sample) -> Finding | str:
-    """Measure how far line integrals fall below proportionality to path lengths, in an object of one material."""
-    if sample.scan.geometry.views < FEWEST_VIEWS:
-        return "too few views"
-    row = highest_contrast_row(sample.scan).thinned().binned(FINE)
-    volume, grid = reconstructed(row)
-    inside = volume > threshold_otsu(volume)
-    lengths = predicted(inside.astype(np.float32), row, grid)
-    longest = float(np.quantile(lengths, 0.999))
-    used = lengths > 0.1 * longest
-    if longest <= 0 or used.sum() < 100:
-        return "no object found"
-    length, p = lengths[used].astype(np.float64) / longest, row.integrals[used].astype(np.float64)
-    (straight, bent), *_ = np.linalg.lstsq(np.stack([length, length**2], axis=1), p, rcond=None)
-    left = p - straight * length - bent * length**2
-    explained = 1 - float(left.var() / p.var())
-    if explained < ONE_MATERIAL:
-        return f"path lengths explain {100 * explained:.0f} % of the line integrals: the object is not of one material"
-    number = float(-bent / straight) if straight > 0 else 0.0
-    verdict = BAD if number >= HARDENING_BAD else LOOK if number >= HARDENING_LOOK else GOOD
-    return Finding(
-        "beam hardening",
-        verdict,
-        f"the line integral of the longest path is {100 * number:.3g} % below the trend of short paths "
-        f"(path length explains {100 * explained:.4g} % of the variance)",
-        number,
-        f"look from {100 * HARDENING_LOOK:g} %, bad from {100 * HARDENING_BAD:g} %",
-        ""
-        if verdict == GOOD
-        else "values inside come out too low (cupping): filter the beam, or correct line integrals by a polynomial",
-    )
-
 
 _LONGEST_PX = 640
 Check = Callable[[Sample], Finding | str]
 CHECKS: dict[str, Check] = {
-    "open beam": values.above_open_beam,
-    "drift": values.drift,
-    "rings": values.rings,
-    "counts": values.counts,
-    "dead pixels": values.unusable,
-    "truncation": views.truncation,
-    "repeated angles": views.repeated_angles,
-    "missing wedge": views.missing_wedge,
-    "number of views": views.few_views,
-    "centre of rotation": centre,
-    "beam hardening": beam_hardening,
+    "open beam": checks.above_open_beam,
+    "drift": checks.drift,
+    "rings": checks.rings,
+    "counts": checks.counts,
+    "dead pixels": checks.unusable,
+    "truncation": checks.truncation,
+    "repeated angles": checks.repeated_angles,
+    "missing wedge": checks.missing_wedge,
+    "number of views": checks.few_views,
+    "centre of rotation": checks.centre,
+    "beam hardening": checks.beam_hardening,
 }
 
 

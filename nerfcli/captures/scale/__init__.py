@@ -1,1 +1,0 @@
-"""Metric scale from known distances, GPS or markers, with its uncertainty."""
