@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.formats.alicevision import parse_alicevision
+from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.errors import BAD_INPUT, UserError
 
@@ -73,7 +74,7 @@ def test_poses_are_world_from_camera_by_rows_and_names_are_relative(tmp_path):
     np.testing.assert_allclose(poses, rigid.from_parts(ROTATIONS, CENTRES), rtol=0, atol=1e-15)
     assert (capture.kind, capture.unit, len(capture.points)) == ("alicevision", "arbitrary", 0)
     (tmp_path / "photos").mkdir()
-    elsewhere = parse_alicevision(write(tmp_path, content()), images=tmp_path / "photos")
+    elsewhere = parse_alicevision(write(tmp_path, content()), UserInputs(tmp_path / "photos"))
     assert [frame.image for frame in elsewhere.frames] == [
         tmp_path / "photos/day 1/a.jpg",
         tmp_path / "photos/day 2/a.jpg",

@@ -11,6 +11,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.bundler import find_bundler, parse_bundler
+from nerfcli.captures.formats.format import UserInputs
 from nerfcli.errors import BAD_INPUT, UserError
 
 LENSES = [(60.0, 0.1, -0.05), (55.0, 0.02, 0.0), (50.0, 0.0, 0.0)]
@@ -19,9 +20,9 @@ POINTS = np.random.default_rng(5).uniform(-1, 1, (7, 3))
 SIZE = (64, 48)
 
 
-def measure(_: Path) -> tuple[int, int, int]:
-    """Stand in for media: every image is 64 x 48 and upright."""
-    return *SIZE, 1
+@pytest.fixture(autouse=True)
+def _photos_of_one_size(monkeypatch):
+    monkeypatch.setattr("nerfcli.captures.orientation.measure", lambda path: (*SIZE, 1))
 
 
 def bundler_cameras() -> list[tuple[np.ndarray, np.ndarray]]:
@@ -66,7 +67,7 @@ def write(folder: Path, text: str, names: list[str] = NAMES, *, on_disk: list[st
 
 
 def parse(path: Path) -> Capture:
-    return parse_bundler(path, measure)
+    return parse_bundler(path)
 
 
 def test_cameras_project_as_in_the_manual(tmp_path):
@@ -129,8 +130,8 @@ def test_the_list_is_found_where_colmap_writes_it(tmp_path):
     with pytest.raises(UserError, match="the list of images next to it is missing"):
         parse(path)
     path = path.rename(path.with_name("model.bundle.out"))
-    assert len(parse_bundler(path, measure, images=tmp_path).frames) == 3
-    given = parse_bundler(path, measure, images=tmp_path, image_list=tmp_path / "bundle" / "model.list.txt")
+    assert len(parse_bundler(path, UserInputs(tmp_path)).frames) == 3
+    given = parse_bundler(path, UserInputs(tmp_path), image_list=tmp_path / "bundle" / "model.list.txt")
     assert [frame.image for frame in given.frames] == [tmp_path / name for name in NAMES]
 
 

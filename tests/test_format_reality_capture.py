@@ -7,6 +7,7 @@ import pytest
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
+from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.reality_capture import parse_reality_capture
 from nerfcli.errors import BAD_INPUT, UserError
 
@@ -26,9 +27,14 @@ LENS = {
 SIZES = {"wide": (64, 48), "tall": (48, 64)}
 
 
-def measure(path: Path) -> tuple[int, int, int]:
-    """Stand in for media: the name gives the size; on.jpg is stored sideways and shown upright."""
-    return (48, 64, 6) if path.stem == "on" else (*SIZES.get(path.stem, (64, 48)), 1)
+@pytest.fixture(autouse=True)
+def _sizes_by_name(monkeypatch):
+    """The name gives the size; on.jpg is stored sideways and shown upright."""
+
+    def measure(path: Path) -> tuple[int, int, int]:
+        return (48, 64, 6) if path.stem == "on" else (*SIZES.get(path.stem, (64, 48)), 1)
+
+    monkeypatch.setattr("nerfcli.captures.orientation.measure", measure)
 
 
 def row(name: str, pose: tuple[float, ...] = (1, 2, 3, 0, 0, 0), lens: dict[str, float] | None = None) -> str:
@@ -80,7 +86,7 @@ def test_both_programs_tables_project_as_their_exports_for_opencv(tmp_path, head
     poses = [tuple(rng.uniform(-180, 180, 6).tolist()) for _ in range(2)]
     touch(tmp_path, "wide.jpg", "tall.jpg")
     path = write(tmp_path, *(row(f"{name}.jpg", pose) for name, pose in zip(SIZES, poses, strict=True)), header=header)
-    capture = parse_reality_capture(path, measure)
+    capture = parse_reality_capture(path)
     in_cam = np.column_stack([rng.uniform(-0.5, 0.5, (100, 2)), np.ones(100)]) * rng.uniform(1, 9, (100, 1))
     for frame, pose, size in zip(capture.frames, poses, SIZES.values(), strict=True):
         in_world = (in_cam * [1, -1, -1]) @ world_from_opengl(*pose[3:]).T + pose[:3]
@@ -101,7 +107,7 @@ def test_both_programs_tables_project_as_their_exports_for_opencv(tmp_path, head
 )
 def test_angles_by_hand(tmp_path, angles, view, up):
     touch(tmp_path, "a.jpg")
-    frame = parse_reality_capture(write(tmp_path, row("a.jpg", (1, 2, 3, *angles))), measure).frames[0]
+    frame = parse_reality_capture(write(tmp_path, row("a.jpg", (1, 2, 3, *angles)))).frames[0]
     np.testing.assert_array_equal(frame.centre, [1, 2, 3])
     np.testing.assert_allclose(frame.world_from_cam[:3, 2], view, rtol=0, atol=1e-15)
     np.testing.assert_allclose(-frame.world_from_cam[:3, 1], up, rtol=0, atol=1e-15)
@@ -112,7 +118,7 @@ def test_names_photos_and_a_line_before_the_header(tmp_path):
     touch(images, "b c.jpg", "ü, 2.jpg", "on.jpg")
     plain = {**dict.fromkeys(LENS, 0), "f": 36.0}
     rows = (row("b c.jpg", lens=plain), row('"ü, 2.jpg"', lens=plain), row("gone.jpg"), row("on.jpg", lens=plain), "")
-    capture = parse_reality_capture(write(tmp_path, *rows, header=f"#cameras 4\n{OLD}"), measure, images=images)
+    capture = parse_reality_capture(write(tmp_path, *rows, header=f"#cameras 4\n{OLD}"), UserInputs(images))
     assert [(frame.name, frame.image) for frame in capture.frames] == [
         ("b c.jpg", images / "b c.jpg"),
         ("ü, 2.jpg", images / "ü, 2.jpg"),
@@ -145,6 +151,6 @@ def test_malformed_files_are_refused_with_file_and_line(tmp_path, rows, header, 
     touch(tmp_path, "a.jpg", "b.jpg")
     path = write(tmp_path, *rows, header=header)
     with pytest.raises(UserError, match=what) as caught:
-        parse_reality_capture(path, measure)
+        parse_reality_capture(path)
     assert caught.value.exit_code == BAD_INPUT
     assert str(path) in caught.value.message

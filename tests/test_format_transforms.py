@@ -12,6 +12,7 @@ from captures import CAMERAS, assert_same, photograph, reprojection_px, ring, wi
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.blender import losses_blender, parse_blender, write_blender
+from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.transforms import (
     losses_transforms,
     parse_transforms,
@@ -36,9 +37,10 @@ OPENGL_POSE = [[0.0, 0.0, 1.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 3.0],
 OPENCV_POSE = [[0.0, 0.0, -1.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, -1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
 
 
-def measure(_: Path) -> tuple[int, int, int]:
-    """Stand in for media: every image is 64 x 48 and upright."""
-    return 64, 48, 1
+@pytest.fixture
+def photos_of(monkeypatch):
+    """Return a function that makes every file of a photo count as one of this size."""
+    return lambda *size: monkeypatch.setattr("nerfcli.captures.orientation.measure", lambda path: (*size, 1))
 
 
 def write_json(path: Path, **content: object) -> Path:
@@ -119,18 +121,17 @@ def test_poses_stay_in_the_files_world(tmp_path):
     np.testing.assert_array_equal(capture.frames[0].world_from_cam, OPENCV_POSE)
 
 
-def test_names_and_sizes_without_the_photos(tmp_path):
+def test_names_and_sizes_without_the_photos(tmp_path, photos_of):
     """Suffixes come from the files on disk; a missing size is measured, or taken from the other photos."""
+    photos_of(64, 48)
     entries = ["./images\\a b.jpg", "images/no_suffix", "images/gone", "/home/you/c.d/x.png"]
     frames = [{"file_path": name, "transform_matrix": OPENGL_POSE} for name in entries]
     path = write_json(tmp_path / "transforms.json", camera_angle_x=1.0, frames=frames)
-    with pytest.raises(UserError, match=r"frames\[0\]: w and h are missing"):
-        parse_transforms(path)
     with pytest.raises(UserError, match=r"frames\[0\]: w and h are missing, and .*images/a b.jpg does not exist"):
-        parse_transforms(path, measure)
+        parse_transforms(path)
     (tmp_path / "images").mkdir()
     (tmp_path / "images/no_suffix.JPG").write_bytes(b"")
-    capture = parse_transforms(path, measure)
+    capture = parse_transforms(path)
     assert [frame.name for frame in capture.frames] == [
         "images/a b.jpg",
         "images/no_suffix.JPG",
@@ -161,21 +162,23 @@ def test_training_gets_the_points_beside_the_file(tmp_path):
     np.testing.assert_array_equal(load_scene(tmp_path).points, capture.points)
 
 
-def test_images_of_blender_files_in_another_folder(tmp_path):
+def test_images_of_blender_files_in_another_folder(tmp_path, photos_of):
+    photos_of(64, 48)
     capture = with_photos(pinhole_ring(), tmp_path / "images")
     named = (replace(f, name=f"r_{i}.png", image=tmp_path / f"train/r_{i}.png") for i, f in enumerate(capture.frames))
     write_blender(replace(capture, frames=tuple(named)), tmp_path)
     with pytest.raises(UserError, match="does not exist"):
-        parse_blender(tmp_path, measure)
+        parse_blender(tmp_path)
     (tmp_path / "elsewhere").mkdir()
     for index in range(len(capture.frames)):
         (tmp_path / "elsewhere" / f"r_{index}.png").touch()
-    parsed = parse_blender(tmp_path, measure, images=tmp_path / "elsewhere")
+    parsed = parse_blender(tmp_path, UserInputs(tmp_path / "elsewhere"))
     assert [f.image for f in parsed.frames] == [tmp_path / "elsewhere" / f"r_{i}.png" for i in range(6)]
     assert parsed.frames[0].camera.width == 64
 
 
-def test_blender_files_are_read_back(tmp_path):
+def test_blender_files_are_read_back(tmp_path, photos_of):
+    photos_of(640, 480)
     capture = with_photos(pinhole_ring(), tmp_path)
     splits = ("train", "train", "train", "val", "test", "test")
     frames = [replace(frame, split=split) for frame, split in zip(capture.frames, splits, strict=True)]
@@ -192,14 +195,14 @@ def test_blender_files_are_read_back(tmp_path):
     (tmp_path / "train").mkdir()
     for path in (png, tmp_path / "my photos/ä 03.jpg", tmp_path / "my photos/ä 05.jpg"):
         path.write_bytes(b"")
-    back = parse_blender(tmp_path, lambda _: (640, 480, 1))
+    back = parse_blender(tmp_path)
     for frame, again in zip(capture.frames, back.frames, strict=True):
         assert (again.name, again.image, again.split) == (frame.name, frame.image, frame.split)
         np.testing.assert_allclose(again.camera.params, frame.camera.params, rtol=1e-14)
         np.testing.assert_allclose(again.world_from_cam, frame.world_from_cam, rtol=0, atol=1e-15)
     png.unlink()  # a missing picture's name gets the suffix of NeRF's loader
     (tmp_path / "my photos/ä 02.jpg").write_bytes(b"")
-    assert parse_blender(tmp_path, lambda _: (640, 480, 1)).frames[0].name == "train/r 0.png"
+    assert parse_blender(tmp_path).frames[0].name == "train/r 0.png"
 
 
 def test_what_blender_cannot_hold_is_listed(tmp_path):
@@ -230,7 +233,7 @@ def test_what_blender_cannot_hold_is_listed(tmp_path):
         write_blender(capture, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["transforms_val.json"]
     with pytest.raises(UserError, match=r"transforms_train\.json: No such file"):
-        parse_blender(tmp_path / "elsewhere", measure)
+        parse_blender(tmp_path / "elsewhere")
 
 
 def test_a_file_written_twice_is_the_same(tmp_path):

@@ -41,7 +41,7 @@ _VECTORS = {
 }
 
 
-def stored_size(path: Path, measure: Measure) -> tuple[int, int]:
+def stored_size(path: Path) -> Size:
     """Return the width and height of an image file before its EXIF orientation is applied."""
     width, height, orientation = measure(path)
     return (height, width) if orientation >= 5 else (width, height)

@@ -32,7 +32,7 @@ from nerfcli.captures.formats.fields import (
     shown,
     size_of,
 )
-from nerfcli.captures.formats.format import Format, by_suffix, has_keys
+from nerfcli.captures.formats.format import Format, UserInputs, by_suffix, has_keys
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
 
@@ -49,17 +49,10 @@ def is_alicevision(content: dict[str, Any]) -> bool:
     return all(isinstance(content.get(key), list) for key in ("version", "views", "intrinsics", "poses"))
 
 
-def parse_alicevision(path: Path, *, images: Path | None = None) -> Capture:
+def parse_alicevision(path: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the views that have a pose, and the points if the file has them.
 
-    Photos are where the file says, or, as it usually comes from another machine, in `images` or beside the file.
-
-    Args:
-        images: the folder of the photos.
-
-    Raises:
-        UserError: the file is damaged (file and field are named), or it has a lens that no COLMAP model holds, or views
-            of a camera rig.
+    Photos are where the file says, or, as it usually comes from another machine, in the given folder or beside it.
     """
     content = read_json_object(path)
     if not is_alicevision(content):
@@ -90,10 +83,10 @@ def parse_alicevision(path: Path, *, images: Path | None = None) -> Capture:
         frames.append(Frame(place, cameras[camera], world_from_cam))
     check_unique_names((frame.name for frame in frames), path)
     sizes = [frame.camera.size for frame in frames]
-    found = find_photos([frame.name for frame in frames], (path.parent,), given=images, sizes=sizes)
+    found = find_photos([frame.name for frame in frames], (path.parent,), given=given.images, sizes=sizes)
     for index, (frame, image) in enumerate(zip(frames, found.paths, strict=True)):
         name = frame.name.removeprefix(folder)
-        frames[index] = replace(frame, name=name, image=image or (images or path.parent) / name)
+        frames[index] = replace(frame, name=name, image=image or (given.images or path.parent) / name)
     points, colours = _points(content.get("structure", []), f"{path}: structure")
     return Capture(
         tuple(frames), points, (), None, "alicevision", colours=colours, notes=(*found.notes, *usable.notes())
@@ -198,5 +191,5 @@ FORMAT = Format(
     "AliceVision, Meshroom",
     ".sfm",
     find_alicevision,
-    lambda path, given: parse_alicevision(path, images=given.images),
+    parse_alicevision,
 )

@@ -12,12 +12,11 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from nerfcli.atomic import write_json
-from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opengl_from_opencv_pose
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, read_json_object
-from nerfcli.captures.formats.format import Format
+from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.transforms import (
     SPLITS,
     listed_frames,
@@ -25,34 +24,23 @@ from nerfcli.captures.formats.transforms import (
     relative_path,
 )
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
-from nerfcli.captures.orientation import Measure, measure
 from nerfcli.errors import UserError
 
 
-def parse_blender(
-    folder: Path, measure: Measure, *, images: Path | None = None, camera: Camera | None = None
-) -> Capture:
+def parse_blender(folder: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read all views of a Blender capture, from the file of every split that exists.
 
-    Args:
-        measure: returns an image's upright size and EXIF orientation, which the files do not give. An image that is not
-            on disk gets the size of the other images in its file.
-        images: folder of the images, if they are not where the files say: under the listed paths, or their last parts.
-        camera: has the size of images that are not on disk if no image of a file is; by default the size of the first.
-
-    Raises:
-        UserError: a file is malformed or lists no image that is on disk, or there is no file.
+    An image that is not on disk gets the size of the other images in its file; if there are none, that of the given
+    camera or of the first image.
     """
     frames, missing, notes = list[Frame](), list[str](), list[str]()
     for split in SPLITS:
         path = _file(folder, split)
         if path.exists():
-            size = camera.size if camera else frames[0].camera.size if frames else None
+            size = given.camera.size if given.camera else frames[0].camera.size if frames else None
             content = read_json_object(path)
             records = records_of(path, content)
-            listed, unknown, said = listed_frames(
-                path, content, records, measure, suffix=".png", images=images, size=size
-            )
+            listed, unknown, said = listed_frames(path, content, records, suffix=".png", images=given.images, size=size)
             frames += [replace(frame, split=split) for frame in listed]
             missing += unknown
             notes += said
@@ -151,7 +139,7 @@ FORMAT = Format(
     "NeRF's synthetic scenes",
     "transforms_train.json",
     find_blender,
-    lambda path, given: parse_blender(path, measure, images=given.images, camera=given.camera),
+    parse_blender,
     axes="opengl",
     open_axes=True,
     files=("transforms_train.json", "transforms_val.json", "transforms_test.json"),

@@ -20,10 +20,10 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, name_of, numbers, read_text
-from nerfcli.captures.formats.format import Format, by_suffix, only_file
+from nerfcli.captures.formats.format import Format, UserInputs, by_suffix, only_file
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
-from nerfcli.captures.orientation import Measure, measure, stored_size
+from nerfcli.captures.orientation import stored_size
 
 BEGINS = "# Bundle file"
 _HEADER = f"{BEGINS} v0.3"
@@ -36,22 +36,13 @@ _FOCAL_GUESS = re.compile(r"[\d.eE+-]+", re.ASCII)
 Numbered = tuple[int, str]
 
 
-def parse_bundler(
-    path: Path, measure: Measure, *, images: Path | None = None, image_list: Path | None = None
-) -> Capture:
+def parse_bundler(path: Path, given: UserInputs = UserInputs(), *, image_list: Path | None = None) -> Capture:
     """Read the registered cameras, the points with their colours, and where the points were seen.
 
     Cameras of focal length 0 are those that Bundler could not register; they give no frames. The file gives neither
     names nor sizes of the photos: names come from the list, and sizes from the photos. Photos that are not on disk are
-    `missing`, and their observations are left out.
-
-    Args:
-        images: the folder that the names are relative to; by default the folder of the list.
-        image_list: the list of images; by default X.list.txt, which COLMAP writes beside X.bundle.out, or list.txt
-            beside the file or in the folder above.
-
-    Raises:
-        UserError: a file is damaged (file and line are named), or none of the photos is on disk.
+    `missing`, and their observations are left out. The list of images is, by default, X.list.txt, which COLMAP writes
+    beside X.bundle.out, or list.txt beside the file or in the folder above.
     """
     lines = _lines(path)
     num_cameras, num_points = _counts(lines, path)
@@ -64,7 +55,7 @@ def parse_bundler(
         )
     registered = [index for index in range(num_cameras) if numbers(*_line(lines, 1 + 5 * index, 3, path))[0] != 0]
     check_unique_names((names[index] for index in registered), image_list if registered else path)
-    found = find_photos([names[index] for index in registered], (image_list.parent,), given=images)
+    found = find_photos([names[index] for index in registered], (image_list.parent,), given=given.images)
     found = found.required(str(path), "the file does not give their sizes")
     poses, frames, middles = FramePoses(), [], []
     index_of_camera = np.full(num_cameras, -1, dtype=np.int64)
@@ -72,7 +63,7 @@ def parse_bundler(
         own = lines[1 + 5 * index : 6 + 5 * index]
         pose = poses.read_inverse(name, f"{path}: line {own[1][0]}", partial(_matrix, own, path))
         if image is not None and pose is not None:
-            size = stored_size(image, measure)
+            size = stored_size(image)
             index_of_camera[index] = len(frames)
             camera = _camera(own, size, path)
             frames.append(Frame(name, camera, opencv_from_opengl_pose(pose), image=image))
@@ -202,6 +193,6 @@ FORMAT = Format(
     "Bundler",
     "bundle.out",
     find_bundler,
-    lambda path, given: parse_bundler(path, measure, images=given.images),
+    parse_bundler,
     axes="opengl",
 )

@@ -22,7 +22,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import colmap_binary, colmap_text
 from nerfcli.captures.formats.colmap_model import ColmapImage, ColmapModel, capture_of, model_of
 from nerfcli.captures.formats.fields import opened
-from nerfcli.captures.formats.format import Format
+from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.photo_names import with_photos
 from nerfcli.captures.formats.unsupported import lost_parts
 from nerfcli.errors import UserError, several
@@ -64,13 +64,14 @@ def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
         ) from error
 
 
-def parse_model(model_dir: Path, *, images: Path | None = None) -> Capture:
+def parse_model(model_dir: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read a COLMAP model, with its photos in the given folder, or in the model's folder or up to three above it.
 
     Other models of the same reconstruction are named in a note.
     """
-    capture = with_photos(parse_colmap(model_dir), model_dir, *model_dir.resolve().parents[:3], given=images)
-    others = [model for model in _models_in(_home_of(model_dir)) if not model.samefile(model_dir)]
+    capture = with_photos(parse_colmap(model_dir), model_dir, *model_dir.resolve().parents[:3], given=given.images)
+    home = model_dir.parent if model_dir.name.isdecimal() else model_dir
+    others = [model for model in _models_in(home) if not model.samefile(model_dir)]
     if not others:
         return capture
     counts = ", ".join(f"{_seen(model)} with {num_images(model)}" for model in others)
@@ -247,11 +248,6 @@ def _models_in(folder: Path) -> list[Path]:
     return [path for path in (*sorted(numbered, key=lambda path: int(path.name)), folder) if is_model(path)]
 
 
-def _home_of(model_dir: Path) -> Path:
-    """Return the folder in which the other models of a reconstruction are."""
-    return model_dir.parent if model_dir.name.isdecimal() else model_dir
-
-
 def _seen(model_dir: Path) -> str:
     return "/".join(model_dir.resolve().parts[-2:])
 
@@ -261,7 +257,7 @@ BINARY = Format(
     "a COLMAP model",
     "sparse/0/cameras.bin or .txt",
     find_model,
-    lambda path, given: parse_model(path, images=given.images),
+    parse_model,
     files=MODEL_FILES,
     is_unordered=True,  # ids of a model are in no particular order
     write=write_colmap_binary,

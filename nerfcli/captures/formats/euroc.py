@@ -29,7 +29,7 @@ from nerfcli.captures.formats.fields import (
     shown,
     size_of,
 )
-from nerfcli.captures.formats.format import Format
+from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.limits import FramePoses, rigid_pose
 from nerfcli.captures.formats.photo_names import with_photos
 from nerfcli.captures.formats.trajectories import photos_at
@@ -42,24 +42,16 @@ _FISHEYE = ("equidistant", "equi")
 _EXPECTED = "expected a file of a EuRoC sequence"
 
 
-def parse_euroc(home: Path, *, images: Path | None = None) -> Capture:
-    """Read the photos of all cameras whose time is within that of the poses; poses are interpolated to it.
-
-    Args:
-        home: the folder mav0.
-        images: a folder of the photos, in which their paths or names are looked for instead.
-
-    Raises:
-        UserError: a file is damaged (file and line are named), or no photo has a pose.
-    """
+def parse_euroc(home: Path, given: UserInputs = UserInputs()) -> Capture:
+    """Read the photos of all cameras in mav0 whose time is within that of the poses; poses are interpolated to it."""
     truth = next(path for name in _TRUTHS if (path := home / name / "data.csv").is_file())
     times, bodies, lost = _bodies(truth)
     names, seconds, views = [], [], []
     for folder in sorted(path.parent for path in home.glob("cam*/data.csv")):
         view = _sensor(folder / "sensor.yaml")
-        for time, file in _pictures(folder / "data.csv"):
-            names.append(f"{folder.name}/data/{file}")
-            seconds.append((time - times[0]) / 1e9)
+        for cells, where in read_rows(folder / "data.csv", _EXPECTED, separator=","):
+            names.append(f"{folder.name}/data/{name_of(','.join(cells[1:]), where)}")
+            seconds.append((_nanoseconds(cells[0], where) - times[0]) / 1e9)
             views.append(view)
     body_seconds = [(time - times[0]) / 1e9 for time in times]
     kept, poses, unposed = photos_at(names, seconds, body_seconds, bodies, where=str(truth))
@@ -70,7 +62,7 @@ def parse_euroc(home: Path, *, images: Path | None = None) -> Capture:
     source = f"motion capture ({truth.parent.name})"
     notes = (*lost, *unposed)
     capture = Capture(frames, kind="euroc", unit="metre", unit_source=source, notes=notes)
-    return with_photos(capture, home, given=images)
+    return with_photos(capture, home, given=given.images)
 
 
 def _bodies(path: Path) -> tuple[list[int], np.ndarray, tuple[str, ...]]:
@@ -86,11 +78,6 @@ def _bodies(path: Path) -> tuple[list[int], np.ndarray, tuple[str, ...]]:
     if not times:
         raise malformed(str(path), "has no pose", _EXPECTED)
     return times, np.stack(poses), notes
-
-
-def _pictures(path: Path) -> list[tuple[int, str]]:
-    rows = read_rows(path, _EXPECTED, separator=",")
-    return [(_nanoseconds(cells[0], where), name_of(",".join(cells[1:]), where)) for cells, where in rows]
 
 
 def _nanoseconds(word: str, where: str) -> int:
@@ -154,6 +141,6 @@ FORMAT = Format(
     "a sequence of EuRoC MAV",
     "mav0/",
     find_euroc,
-    lambda path, given: parse_euroc(path, images=given.images),
+    parse_euroc,
     open_centre=True,
 )

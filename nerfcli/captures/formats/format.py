@@ -39,7 +39,7 @@ class Format:
         of: what it is, or which programs write it.
         looked_for: what it is recognised by, in a few words for people; "" for formats that are only written.
         find: returns where such a capture is in a file or folder; None if there is none.
-        parse: reads what `find` found, or what `write` wrote.
+        parse: reads what `find` found, or what `write` wrote, with the further input of the user.
         axes: the camera axes of its poses, as three letters or a name.
         open_axes: whether poses with other axes are found in such files, so that --axes makes sense.
         open_centre: whether principal points with other pixel centres are found in such files.

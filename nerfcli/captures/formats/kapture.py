@@ -26,7 +26,7 @@ from nerfcli.captures.formats.fields import (
     shown,
     size_of,
 )
-from nerfcli.captures.formats.format import Format
+from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.limits import NotFiniteError, checked_camera, left_out, without
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, with_photos
 from nerfcli.errors import UserError, several
@@ -39,17 +39,8 @@ _UNKNOWN = "UNKNOWN_CAMERA"
 _MOST_LEVELS = 8
 
 
-def parse_kapture(folder: Path, *, camera: Camera | None = None, images: Path | None = None) -> Capture:
-    """Read the photos that have a pose, of all cameras.
-
-    Args:
-        folder: holds sensors/.
-        camera: of the sensors whose model is not known.
-        images: the folder of the photos instead of sensors/records_data.
-
-    Raises:
-        UserError: a file is damaged (file and line are named), no photo has a pose, or a camera is not known.
-    """
+def parse_kapture(folder: Path, given: UserInputs = UserInputs()) -> Capture:
+    """Read the photos that have a pose, of all cameras; the user gives that of sensors whose model is not known."""
     home = folder / SENSORS
     cameras = {row.cells[0]: row for row in _rows(home / "sensors.txt", least=3) if row.cells[2] == "camera"}
     poses = {(row.cells[0], row.cells[1]): row for row in _rows(home / "trajectories.txt", least=9)}
@@ -72,13 +63,13 @@ def parse_kapture(folder: Path, *, camera: Camera | None = None, images: Path | 
         if sensor not in cameras:
             raise malformed(row.where, f"its sensor is {shown(sensor)}", "expected a camera of sensors.txt")
         if sensor not in known:
-            known[sensor] = _camera(cameras[sensor], camera)
+            known[sensor] = _camera(cameras[sensor], given.camera)
         frames.append(Frame(name, known[sensor], rigid.inverse(device_from_world)))
     check_unique_names((frame.name for frame in frames), folder)
     points, colours = _points(folder / "reconstruction/points3d.txt")
     notes = (*left_out(lost, len(frames) + len(lost)), *without(unposed, "a pose"))
     capture = Capture(tuple(frames), points, kind="kapture", colours=colours, notes=notes)
-    return with_photos(capture, home, given=images, folders=("records_data",))
+    return with_photos(capture, home, given=given.images, folders=("records_data",))
 
 
 def _rows(path: Path, *, least: int) -> list[Row]:
@@ -152,5 +143,5 @@ FORMAT = Format(
     "kapture",
     "sensors/trajectories.txt",
     find_kapture,
-    lambda path, given: parse_kapture(path, camera=given.camera, images=given.images),
+    parse_kapture,
 )

@@ -19,7 +19,7 @@ from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import DAMAGED, array_of_npy
-from nerfcli.captures.formats.format import Format, folder_with
+from nerfcli.captures.formats.format import Format, UserInputs, folder_with
 from nerfcli.captures.formats.limits import FramePoses, checked_camera, plausible
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
 from nerfcli.errors import UserError
@@ -33,7 +33,7 @@ IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
 _NEAR_PERCENT, _FAR_PERCENT = 0.1, 99.9
 
 
-def parse_llff(folder: Path, *, images: Path | None = None) -> Capture:
+def parse_llff(folder: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read poses_bounds.npy; cameras are for the full-size photos.
 
     The file does not name the photos. They are those of `images`, or of the first image folder that holds one per row.
@@ -45,9 +45,12 @@ def parse_llff(folder: Path, *, images: Path | None = None) -> Capture:
     path = folder / FILE
     rows = _read_rows(path)
     places = [place for place in (folder / name for name in IMAGE_FOLDERS) if place.is_dir()]
-    places = places if images is None else [images]
+    places = places if given.images is None else [given.images]
     photos = _photos_of_rows(path, len(rows), places) if places else [None] * len(rows)
-    names = [f"image{index:03d}" if image is None else _name(image) for index, image in enumerate(photos)]
+    names = [
+        f"image{index:03d}" if image is None else f"{image.parent.name}/{image.name}"
+        for index, image in enumerate(photos)
+    ]
     matrices, poses = rows[:, :15].reshape(-1, 3, 5), FramePoses()
     views = [
         poses.read(name, f"{path}: row {index}", partial(np.array, matrix[:, :4]))
@@ -135,10 +138,6 @@ def _photos_of_rows(path: Path, count: int, folders: Sequence[Path]) -> Sequence
     )
 
 
-def _name(image: Path) -> str:
-    return f"{image.parent.name}/{image.name}"
-
-
 def _camera(size_and_focal: Iterable[float], where: str) -> Camera:
     height, width, focal = size_and_focal
     if not min(height, width) >= 1 or not focal > 0 or not max(height, width, focal) < np.inf:  # True at NaN
@@ -190,7 +189,7 @@ FORMAT = Format(
     "poses_bounds.npy",
     "poses_bounds.npy",
     folder_with(FILE),
-    lambda path, given: parse_llff(path, images=given.images),
+    parse_llff,
     axes="llff",
     open_axes=True,
     files=("poses_bounds.npy",),

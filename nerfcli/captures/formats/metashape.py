@@ -66,7 +66,7 @@ def parse_metashape(path: Path) -> Capture:
     """
     chunk = _chunk(path)
     groups = {camera: group.get("label", "") for group in chunk.iterfind("cameras/group") for camera in group}
-    listed = [camera for camera in chunk.iterfind("cameras//camera") if _is_enabled(camera)]
+    listed = [one for one in chunk.iterfind("cameras//camera") if one.get("enabled", "true") not in ("false", "0")]
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
     reasons = {camera: _unusable(camera, sensors) for camera in listed}
     records = [camera for camera in listed if not reasons[camera]]
@@ -127,10 +127,6 @@ def _chunk(path: Path) -> Element:
     if chunk is None:
         raise malformed(str(path), f"has no chunk element, but a {shown(root.tag)}", _EXPECTED)
     return chunk
-
-
-def _is_enabled(record: Element) -> bool:
-    return record.get("enabled", "true") not in ("false", "0")
 
 
 def _worlds_from_chunk(chunk: Element, path: Path) -> dict[str | None, rigid.Similarity | None]:

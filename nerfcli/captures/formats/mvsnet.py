@@ -19,11 +19,11 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, malformed, matrix_of, numbers, read_text
-from nerfcli.captures.formats.format import Format
+from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
-from nerfcli.captures.orientation import measure, stored_size
+from nerfcli.captures.orientation import stored_size
 
 CAMERA_FOLDER = "cams"
 CAMERA_FILES = "*_cam.txt"
@@ -32,17 +32,11 @@ IMAGE_FOLDERS = ("images", "blended_images")
 _EXPECTED = "expected the word extrinsic, 16 numbers, the word intrinsic, 9 numbers, and a line of 2 to 4 depths"
 
 
-def parse_mvsnet(folder: Path, *, images: Path | None = None) -> Capture:
-    """Read the cameras in cams/, with their depth bounds where all files have them.
-
-    The photos are in `images`, by default images/ or blended_images/.
-
-    Raises:
-        UserError: a file is damaged (it is named), or no photo is on disk.
-    """
+def parse_mvsnet(folder: Path, given: UserInputs = UserInputs()) -> Capture:
+    """Read the cameras in cams/, with their depth bounds where all files have them."""
     files = sorted((folder / CAMERA_FOLDER).glob(CAMERA_FILES))
     stems = [file.name.removesuffix(CAMERA_FILES[1:]) for file in files]
-    photos = find_photos(stems, (folder,), given=images, folders=IMAGE_FOLDERS)
+    photos = find_photos(stems, (folder,), given=given.images, folders=IMAGE_FOLDERS)
     photos = photos.required(str(folder), "they give the names")
     fits, poses, frames, bounds = Fits(), FramePoses(), [], []
     for file, stem, image in zip(files, stems, photos.paths, strict=True):
@@ -52,7 +46,7 @@ def parse_mvsnet(folder: Path, *, images: Path | None = None) -> Capture:
         matrix = matrix_of(fields[18:27], 3, 3, f"{file}: intrinsic")
         depths = numbers(fields[27:], len(fields) - 27, f"{file}: depths")
         if image is not None and pose is not None:
-            camera = fits.matrix(matrix, stored_size(image, measure), f"{file}: intrinsic")
+            camera = fits.matrix(matrix, stored_size(image), f"{file}: intrinsic")
             frames.append(Frame(image.name, camera, pose, image=image))
             bounds.append(_bounds(depths))
     notes = (*photos.notes, *poses.notes(), *fits.notes())
@@ -87,5 +81,5 @@ FORMAT = Format(
     "cams/ of MVSNet, BlendedMVS",
     "cams/",
     find_mvsnet,
-    lambda path, given: parse_mvsnet(path, images=given.images),
+    parse_mvsnet,
 )

@@ -31,7 +31,7 @@ from nerfcli.captures.formats.fields import (
     size_of,
     vector,
 )
-from nerfcli.captures.formats.format import Format, has_keys
+from nerfcli.captures.formats.format import Format, UserInputs, has_keys
 from nerfcli.captures.formats.limits import FramePoses, plausible, without
 from nerfcli.captures.formats.photo_names import find_photos
 
@@ -40,15 +40,8 @@ CAMERAS, DATASET = "camera", "dataset.json"
 _IMAGE_FOLDERS = tuple(f"rgb/{factor}x" for factor in (1, 2, 4, 8, 16))
 
 
-def parse_nerfies(folder: Path, *, images: Path | None = None) -> Capture:
-    """Read the frames in dataset.json, or all cameras without one; the unit is arbitrary.
-
-    Args:
-        images: the folder of the photos; by default the first of rgb/1x, rgb/2x, ...
-
-    Raises:
-        UserError: a file is damaged (file and field are named), or lists a camera without its file.
-    """
+def parse_nerfies(folder: Path, given: UserInputs = UserInputs()) -> Capture:
+    """Read the frames in dataset.json, or all cameras without one; the unit is arbitrary."""
     path = folder / DATASET
     content = read_json_object(path) if path.is_file() else {}
     train, held_out = (_names(content, key, path) for key in ("train_ids", "val_ids"))
@@ -62,7 +55,7 @@ def parse_nerfies(folder: Path, *, images: Path | None = None) -> Capture:
     cameras = [_camera(record, str(files[name])) for name, record in zip(names, records, strict=True)]
     there = [name for name in _IMAGE_FOLDERS if (folder / name).is_dir()]
     homes = [folder / there[0]] if there else [folder]
-    found = find_photos(names, homes, given=images, sizes=[camera.size for camera in cameras])
+    found = find_photos(names, homes, given=given.images, sizes=[camera.size for camera in cameras])
     splits = {**dict.fromkeys(train, "train"), **dict.fromkeys(held_out, "val")} if held_out else {}
     poses, frames = FramePoses(), []
     for name, camera, record, place in zip(names, cameras, records, found.places, strict=True):
@@ -154,5 +147,5 @@ FORMAT = Format(
     "Nerfies, HyperNeRF, DyCheck",
     "camera/*.json",
     find_nerfies,
-    lambda path, given: parse_nerfies(path, images=given.images),
+    parse_nerfies,
 )

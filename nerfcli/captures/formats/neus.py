@@ -17,11 +17,11 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import DAMAGED, array_of_npy, malformed, members_of_npz
-from nerfcli.captures.formats.format import Format, named
+from nerfcli.captures.formats.format import Format, UserInputs, named
 from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import plausible
 from nerfcli.captures.formats.photo_names import GIVE_PHOTOS
-from nerfcli.captures.orientation import measure, stored_size
+from nerfcli.captures.orientation import stored_size
 from nerfcli.errors import UserError
 from nerfcli.photos.images import list_images
 
@@ -36,17 +36,10 @@ _SINGULAR = 1e-9
 _ROUNDING_PX = 0.01
 
 
-def parse_neus(path: Path, *, images: Path | None = None) -> Capture:
-    """Read the cameras of the file, in its world; the photos are those beside it, in order.
-
-    Args:
-        images: the folder of the photos; by default image/, images/ or rgb/ beside the file.
-
-    Raises:
-        UserError: the file is damaged (the array is named), or has another number of cameras than there are photos.
-    """
+def parse_neus(path: Path, given: UserInputs = UserInputs()) -> Capture:
+    """Read the cameras of the file, in its world; the photos are those beside it, in order."""
     members = members_of_npz(path)
-    photos = _pictures(path.parent, (images,) if images else IMAGE_FOLDERS)
+    photos = _pictures(path.parent, (given.images,) if given.images else IMAGE_FOLDERS)
     masks = _pictures(path.parent, MASK_FOLDERS)
     count = 0
     while f"world_mat_{count}" in members:
@@ -62,7 +55,7 @@ def parse_neus(path: Path, *, images: Path | None = None) -> Capture:
     matrices = _without_rounding(np.array([matrix for matrix, _ in views]))
     fits, frames = Fits(), []
     for index, (image, matrix) in enumerate(zip(photos, matrices, strict=True)):
-        camera = fits.matrix(matrix, stored_size(image, measure), f"{path}: {names[index]}")
+        camera = fits.matrix(matrix, stored_size(image), f"{path}: {names[index]}")
         mask = masks[index] if len(masks) == count else None
         frames.append(Frame(image.name, camera, views[index][1], image=image, mask=mask))
     return Capture(tuple(frames), kind="neus", notes=fits.notes())
@@ -126,5 +119,5 @@ FORMAT = Format(
     "projections of IDR, NeuS",
     ".npz",
     find_neus,
-    lambda path, given: parse_neus(path, images=given.images),
+    parse_neus,
 )

@@ -33,7 +33,7 @@ from nerfcli.captures.formats.fields import (
     size_of,
     vector,
 )
-from nerfcli.captures.formats.format import Format, has_keys, named
+from nerfcli.captures.formats.format import Format, UserInputs, has_keys, named
 from nerfcli.captures.formats.limits import FramePoses, plausible, without
 from nerfcli.captures.formats.photo_names import with_photos
 
@@ -53,14 +53,10 @@ _SPHERICAL = "spherical"
 _FIRST = 1 << 31
 
 
-def parse_openmvg(path: Path, *, images: Path | None = None) -> Capture:
+def parse_openmvg(path: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the views that have a pose and intrinsics, and the points with their observations.
 
-    Args:
-        images: the folder of the photos; by default the file's root_path, or images/ beside the file or above it.
-
-    Raises:
-        UserError: the file is damaged (file and field are named), or no view has a pose.
+    Photos are in the file's root_path, or in images/ beside the file or above it.
     """
     content = read_json_object(path)
     cameras = _cameras(content, path)
@@ -82,7 +78,7 @@ def parse_openmvg(path: Path, *, images: Path | None = None) -> Capture:
     notes = (*usable.notes(), *without(unposed, "a pose"))
     capture = Capture(tuple(frames), points, kind="openmvg", observations=observations, notes=notes)
     home = path.parent / name_of(content.get("root_path") or ".", str(path))
-    return with_photos(capture, home, path.parent, path.parent.parent, given=images)
+    return with_photos(capture, home, path.parent, path.parent.parent, given=given.images)
 
 
 def _entries(content: dict[str, Any], key: str, home: Path | str) -> Iterator[tuple[int, dict[str, Any], str]]:
@@ -157,11 +153,8 @@ def _structure(content: dict[str, Any], frame_of: dict[int, int], path: Path) ->
 def find_openmvg(path: Path) -> Path | None:
     """Find an sfm_data.json of OpenMVG, in a folder or in that of a reconstruction in it."""
     found = path if path.is_file() and path.suffix.lower() == ".json" else named(*FILES)(path)
-    return found if found is not None and has_keys(found, b'"sfm_data_version"', _is_openmvg) else None
-
-
-def _is_openmvg(content: dict[str, Any]) -> bool:
-    return all(key in content for key in ("sfm_data_version", "views", "intrinsics", "extrinsics"))
+    keys = {"sfm_data_version", "views", "intrinsics", "extrinsics"}
+    return found if found and has_keys(found, b'"sfm_data_version"', lambda content: keys <= set(content)) else None
 
 
 FORMAT = Format(
@@ -169,6 +162,6 @@ FORMAT = Format(
     "OpenMVG",
     "sfm_data.json",
     find_openmvg,
-    lambda path, given: parse_openmvg(path, images=given.images),
+    parse_openmvg,
     open_centre=True,
 )

@@ -18,7 +18,7 @@ from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, number, read_json_object, size_of
-from nerfcli.captures.formats.format import Format
+from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.limits import FramePoses, checked_camera
 from nerfcli.captures.formats.photo_names import find_photos
 
@@ -35,14 +35,8 @@ def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
     return next((pair for pair in pairs if pair[1].is_dir()), pairs[0] if pairs else None)
 
 
-def parse_polycam(folder: Path, *, images: Path | None = None) -> Capture:
-    """Read the keyframes of a capture; the unit is the metre, by LiDAR.
-
-    The photos are in the folder beside the cameras, or in `images`.
-
-    Raises:
-        UserError: a file is damaged (file and field are named), or no photo is on disk.
-    """
+def parse_polycam(folder: Path, given: UserInputs = UserInputs()) -> Capture:
+    """Read the keyframes of a capture; the unit is the metre, by LiDAR. Photos are beside the cameras."""
     found = polycam_folders(folder)
     assert found is not None
     stems, views, poses = [], [], FramePoses()
@@ -55,12 +49,15 @@ def parse_polycam(folder: Path, *, images: Path | None = None) -> Capture:
         stems.append(file.stem)
         views.append((camera, poses.read(file.stem, where, partial(_matrix, record, where))))
     sizes = [camera.size for camera, _ in views]
-    photos = find_photos(stems, (found[1],), given=images, sizes=sizes).required(str(folder), "they give the names")
-    frames = [
-        Frame(image.name, camera, opencv_from_opengl_pose(pose), image=image, depth=_depth(found[0].parent, stem))
-        for stem, image, (camera, pose) in zip(stems, photos.paths, views, strict=True)
-        if image is not None and pose is not None
-    ]
+    photos = find_photos(stems, (found[1],), given=given.images, sizes=sizes).required(
+        str(folder), "they give the names"
+    )
+    frames = []
+    for stem, image, (camera, pose) in zip(stems, photos.paths, views, strict=True):
+        if image is not None and pose is not None:
+            depth, confidence = (found[0].parent / kind / f"{stem}.png" for kind in ("depth", "confidence"))
+            measured = SensorDepth.found(depth, unit=MILLIMETRE, confidence=confidence)
+            frames.append(Frame(image.name, camera, opencv_from_opengl_pose(pose), image=image, depth=measured))
     whole = len(list((folder / KEYFRAMES / "cameras").glob("*.json")))
     left = (f"{whole - len(stems)} of {whole} keyframes left out, whose poses Polycam has not corrected",)
     notes = (*photos.notes, *poses.notes(), *(left if whole > len(stems) else ()))
@@ -80,12 +77,6 @@ def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
     return np.array([number(record, key, where) for key in _POSE]).reshape(3, 4)
 
 
-def _depth(home: Path, stem: str) -> SensorDepth | None:
-    """Return the depth map of a frame; None if it is not on disk."""
-    confidence = home / "confidence" / f"{stem}.png"
-    return SensorDepth.found(home / "depth" / f"{stem}.png", unit=MILLIMETRE, confidence=confidence)
-
-
 def find_polycam(path: Path) -> Path | None:
     """Find the folder that holds the keyframes of Polycam, or the one that they are in."""
     folder = path.parent if path.name == KEYFRAMES else path
@@ -97,6 +88,6 @@ FORMAT = Format(
     "raw data of Polycam",
     "keyframes/",
     find_polycam,
-    lambda path, given: parse_polycam(path, images=given.images),
+    parse_polycam,
     axes="opengl",
 )

@@ -30,11 +30,11 @@ from nerfcli.captures.formats.fields import (
     read_text,
     size_of,
 )
-from nerfcli.captures.formats.format import Format
+from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses, checked_camera
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, FoundPhotos, find_photos
-from nerfcli.captures.orientation import measure, stored_size
+from nerfcli.captures.orientation import stored_size
 from nerfcli.errors import UserError
 
 POSE_FOLDERS = ("pose", "poses")
@@ -63,35 +63,22 @@ def is_pose(path: Path) -> bool:
         return len(stream.read(10_000).split()) in (12, 16)
 
 
-def parse_pose_files(
-    folder: Path,
-    *,
-    camera: Camera | None = None,
-    images: Path | None = None,
-) -> Capture:
-    """Read the poses in a folder, and the intrinsics beside them.
+def parse_pose_files(folder: Path, given: UserInputs = UserInputs()) -> Capture:
+    """Read the poses in a folder, see `pose_files`, and the intrinsics beside them, unless the user gives a camera.
 
     A pose with numbers that are not finite is that of a photo that was not tracked, and gives no frame. Photos are
     found by the names of the pose files; those that are not on disk are `missing`.
-
-    Args:
-        folder: holds the poses, see `pose_files`.
-        camera: of all photos, resized to them; None for the intrinsics in the folder.
-        images: the folder of the photos; by default color/, rgb/, images/ or image/, else that of the poses.
-
-    Raises:
-        UserError: a file is damaged (file and line are named), there are no intrinsics, or no photo is on disk.
     """
     files = pose_files(folder)
     stems = [file.name.removesuffix(".txt").removesuffix(".pose") for file in files]
-    photos = _photos(stems, (folder, files[0].parent), images).required(str(folder), "they give the names")
+    photos = _photos(stems, (folder, files[0].parent), given.images).required(str(folder), "they give the names")
     fits, poses, frames = Fits(), FramePoses(), []
-    camera_of_size = _cameras(folder, camera, fits)
+    camera_of_size = _cameras(folder, given.camera, fits)
     names_give_splits = all(file.name[:2] in _SPLITS for file in files)
     for file, stem, image in zip(files, stems, photos.paths, strict=True):
         world_from_cam = poses.read(stem, str(file), partial(_matrix, file))
         if image is not None and world_from_cam is not None:
-            own_camera = camera_of_size(stored_size(image, measure))
+            own_camera = camera_of_size(stored_size(image))
             split = _SPLITS[stem[:2]] if names_give_splits else None
             maps = (folder / "depth" / f"{stem}.png", file.with_name(f"{stem}.depth.png"))
             depth = SensorDepth.found(*maps, unit=MILLIMETRE)
@@ -158,5 +145,5 @@ FORMAT = Format(
     "a matrix per photo, as in ScanNet, 7-Scenes, NSVF",
     "pose/*.txt",
     find_pose_files,
-    lambda path, given: parse_pose_files(path, camera=given.camera, images=given.images),
+    parse_pose_files,
 )

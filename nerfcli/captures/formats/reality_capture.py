@@ -36,11 +36,11 @@ from nerfcli.captures.formats.fields import (
     read_xml,
     shown,
 )
-from nerfcli.captures.formats.format import Format, by_suffix, only_file
+from nerfcli.captures.formats.format import Format, UserInputs, by_suffix, only_file
 from nerfcli.captures.formats.lenses import Fits, Terms
 from nerfcli.captures.formats.limits import FramePoses, NotFiniteError, left_out
 from nerfcli.captures.formats.photo_names import find_photos
-from nerfcli.captures.orientation import Measure, measure, stored_size
+from nerfcli.captures.orientation import stored_size
 from nerfcli.errors import UserError, listed, several
 
 _EXPECTED = 'expected a file of RealityScan\'s export "Internal/External camera parameters"'
@@ -55,22 +55,17 @@ _COLUMNS = {
 _NUMBERS = ("x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 
 
-def parse_reality_capture(path: Path, measure: Measure, *, images: Path | None = None) -> Capture:
+def parse_reality_capture(path: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the cameras of the file, in the coordinates that it was exported in (z up); the unit stays arbitrary.
 
     The file does not give the size of the photos, so they are measured; those that are not on disk are `missing`.
     Distortion must be of one of the Brown models: the division model gives k1 another meaning, and the file does not
     say which model it is.
-
-    Args:
-        images: the folder that the names in the file are relative to; by default the file's own.
-
-    Raises:
-        UserError: the file is damaged (file and line are named), has a lens that no COLMAP model holds, or none of its
-            photos is on disk.
     """
     names, rows, places, lost = _table(path)
-    found = find_photos(names, (path.parent,), given=images).required(str(path), "the file does not give their sizes")
+    found = find_photos(names, (path.parent,), given=given.images).required(
+        str(path), "the file does not give their sizes"
+    )
     value = {key: rows[:, index] for index, key in enumerate(_NUMBERS)}
     angles = np.stack([-value["heading"], value["pitch"], value["roll"]], axis=-1)
     rotations = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
@@ -79,7 +74,7 @@ def parse_reality_capture(path: Path, measure: Measure, *, images: Path | None =
     for index, (name, image) in enumerate(zip(found.names, found.paths, strict=True)):
         if image is not None:
             intrinsics: dict[str, float] = dict(zip(_NUMBERS[6:], rows[index, 6:].tolist(), strict=True))
-            camera = camera_of_values(intrinsics, stored_size(image, measure), places[index], fits)
+            camera = camera_of_values(intrinsics, stored_size(image), places[index], fits)
             frames.append(Frame(name, camera, poses[index], image=image))
     notes = (*found.notes, *lost, *fits.notes())
     return Capture(tuple(frames), missing=found.missing, kind="reality_capture", notes=notes)
@@ -165,7 +160,7 @@ TABLE = Format(
     "RealityScan, RealityCapture",
     ".csv",
     find_reality_capture,
-    lambda path, given: parse_reality_capture(path, measure, images=given.images),
+    parse_reality_capture,
 )
 
 
@@ -176,18 +171,11 @@ _MODELS = ("perspective", "brown3", "brown3t2", "brown4", "brown4t2")
 _TERMS = ("k1", "k2", "k3", "k4", "t1", "t2")
 
 
-def parse_realityscan_xmp(folder: Path, *, images: Path | None = None) -> Capture:
+def parse_realityscan_xmp(folder: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the cameras of the photos in a folder, in the coordinates that they were exported in; the unit is arbitrary.
 
     Files of other programs, or with intrinsics only, and those with coordinates relative to a camera rig give no frame.
     The files do not give the size of the photos, so these are measured.
-
-    Args:
-        images: the folder of the photos; by default that of the files.
-
-    Raises:
-        UserError: a file is damaged (file and field are named), has a lens that no COLMAP model holds, or none of the
-            photos is on disk.
     """
     posed, without = [], []
     for path in sorted(folder.iterdir()):
@@ -197,12 +185,12 @@ def parse_realityscan_xmp(folder: Path, *, images: Path | None = None) -> Captur
             (posed if has_pose else without).append((path, value))
     if not posed:
         raise malformed(str(folder), "its XMP files have no poses", "align the photos, and export XMP with poses")
-    found = find_photos([path.stem for path, _ in posed], [folder], given=images)
+    found = find_photos([path.stem for path, _ in posed], [folder], given=given.images)
     found = found.required(str(folder), "they give the sizes of the pictures")
     fits, poses, frames = Fits(), FramePoses(), []
     for (path, value), image in zip(posed, found.paths, strict=True):
         if image is not None:
-            camera = _camera(value, stored_size(image, measure), str(path), fits)
+            camera = _camera(value, stored_size(image), str(path), fits)
             pose = poses.read(image.name, f"{path}: Rotation", partial(_pose, value, str(path)))
             if pose is not None:
                 frames.append(Frame(image.name, camera, pose, image=image))
@@ -281,5 +269,5 @@ XMP = Format(
     "RealityScan, RealityCapture",
     ".xmp",
     find_realityscan_xmp,
-    lambda path, given: parse_realityscan_xmp(path, images=given.images),
+    parse_realityscan_xmp,
 )

@@ -17,7 +17,7 @@ from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.frame import Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed, number, read_json_object, shown, size_of, vector
-from nerfcli.captures.formats.format import Format, has_keys, named
+from nerfcli.captures.formats.format import Format, UserInputs, has_keys, named
 from nerfcli.captures.formats.limits import FramePoses, checked_camera
 from nerfcli.captures.formats.photo_names import find_photos
 
@@ -32,16 +32,8 @@ def is_record3d(content: dict[str, Any]) -> bool:
     return all(key in content for key in (_POSES, "K", "w", "h"))
 
 
-def parse_record3d(path: Path, *, images: Path | None = None) -> Capture:
-    """Read the frames of a capture; the unit is the metre, by LiDAR or ARKit.
-
-    Args:
-        path: metadata.json, or metadata as in an unpacked .r3d file.
-        images: the folder of the photos; by default rgb/, rgbd/ or images/ beside the file.
-
-    Raises:
-        UserError: the file is damaged (file and field are named), or no photo is on disk.
-    """
+def parse_record3d(path: Path, given: UserInputs = UserInputs()) -> Capture:
+    """Read the frames of a capture; the unit is the metre, by LiDAR or ARKit."""
     content = read_json_object(path)
     where = str(path)
     size = size_of(number(content, "w", where), number(content, "h", where), where)
@@ -49,7 +41,7 @@ def parse_record3d(path: Path, *, images: Path | None = None) -> Capture:
     if not isinstance(poses, list) or not poses:
         raise malformed(where, f"{_POSES} is {shown(poses)}", "expected a list of poses")
     stems, sizes = [str(index) for index in range(len(poses))], [size] * len(poses)
-    photos = find_photos(stems, (path.parent,), given=images, folders=IMAGE_FOLDERS, sizes=sizes)
+    photos = find_photos(stems, (path.parent,), given=given.images, folders=IMAGE_FOLDERS, sizes=sizes)
     photos = photos.required(where, "they give the names")
     usable, frames = FramePoses(), []
     intrinsics = _intrinsics(content, len(poses), where).tolist()
@@ -89,6 +81,6 @@ FORMAT = Format(
     "Record3D",
     "metadata.json",
     find_record3d,
-    lambda path, given: parse_record3d(path, images=given.images),
+    parse_record3d,
     axes="opengl",
 )

@@ -18,11 +18,11 @@ from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed, read_json_object, vector
-from nerfcli.captures.formats.format import Format, has_keys
+from nerfcli.captures.formats.format import Format, UserInputs, has_keys
 from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos
-from nerfcli.captures.orientation import measure, stored_size
+from nerfcli.captures.orientation import stored_size
 
 _POSE = "cameraPoseARFrame"
 _FRAME = re.compile(r"frame_\d+\.json", re.IGNORECASE | re.ASCII)
@@ -34,17 +34,10 @@ def frame_files(folder: Path) -> list[Path]:
     return sorted(files, key=lambda path: (len(path.name), path.name))
 
 
-def parse_scanner_app(folder: Path, *, images: Path | None = None) -> Capture:
-    """Read the frames that have a photo; the unit is the metre, by ARKit.
-
-    Args:
-        images: the folder of the photos; by default that of the files.
-
-    Raises:
-        UserError: a file is damaged (file and field are named), or no photo is on disk.
-    """
+def parse_scanner_app(folder: Path, given: UserInputs = UserInputs()) -> Capture:
+    """Read the frames that have a photo; the unit is the metre, by ARKit."""
     files = frame_files(folder)
-    found = find_photos([path.stem for path in files], [folder], given=images)
+    found = find_photos([path.stem for path in files], [folder], given=given.images)
     found = found.required(str(folder), "they give the sizes of the pictures")
     fits, poses, frames = Fits(), FramePoses(), []
     for path, image in zip(files, found.paths, strict=True):
@@ -52,7 +45,7 @@ def parse_scanner_app(folder: Path, *, images: Path | None = None) -> Capture:
             continue
         where, record = str(path), read_json_object(path)
         matrix = vector(record, "intrinsics", 9, where).reshape(3, 3)
-        camera = fits.matrix(matrix, stored_size(image, measure), f"{where}: intrinsics")
+        camera = fits.matrix(matrix, stored_size(image), f"{where}: intrinsics")
         pose = poses.read(image.name, f"{where}: {_POSE}", partial(_matrix, record, where))
         if pose is not None:
             depth, confidence = (folder / f"{path.stem.replace('frame', kind)}.png" for kind in ("depth", "conf"))
@@ -84,6 +77,6 @@ FORMAT = Format(
     "3D Scanner App",
     "frame_00000.json",
     find_scanner_app,
-    lambda path, given: parse_scanner_app(path, images=given.images),
+    parse_scanner_app,
     axes="opengl",
 )

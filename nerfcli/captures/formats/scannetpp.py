@@ -12,10 +12,9 @@ from pathlib import Path
 
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, malformed, read_json_object
-from nerfcli.captures.formats.format import Format, has_keys
+from nerfcli.captures.formats.format import Format, UserInputs, has_keys
 from nerfcli.captures.formats.photo_search import plain_name
 from nerfcli.captures.formats.transforms import listed_frames, records_of
-from nerfcli.captures.orientation import measure
 from nerfcli.errors import several
 
 FILES = ("transforms.json", "transforms_undistorted.json")
@@ -24,15 +23,8 @@ _HELD_OUT = "test_frames"
 _SPLITS = {"frames": "train", _HELD_OUT: "test"}
 
 
-def parse_scannetpp(path: Path, *, images: Path | None = None) -> Capture:
-    """Read the photos of both lists that are not marked as bad, with their masks where these are on disk.
-
-    Args:
-        images: the folder of the photos instead of the one that the file is for.
-
-    Raises:
-        UserError: the file is damaged; file and field are named.
-    """
+def parse_scannetpp(path: Path, given: UserInputs = UserInputs()) -> Capture:
+    """Read the photos of both lists that are not marked as bad, with their masks where these are on disk."""
     content = read_json_object(path)
     kind = "undistorted" if "undistorted" in path.stem else "resized"
     home = path.parent.parent if path.parent.name == "nerfstudio" else path.parent
@@ -45,7 +37,7 @@ def parse_scannetpp(path: Path, *, images: Path | None = None) -> Capture:
     good = [(record, where) for record, where, _ in both if record.get("is_bad") is not True]
     if not good:
         raise malformed(str(path), "marks all photos as bad", "copy the scene again")
-    frames, missing, notes = listed_frames(path, content, good, measure, images=images, home=home, folders=folders)
+    frames, missing, notes = listed_frames(path, content, good, images=given.images, home=home, folders=folders)
     check_unique_names((frame.name for frame in frames), path)
     split_of = {plain_name(str(record.get("file_path"))): split for record, _, split in both}
     if "test" in (splits := [split_of.get(frame.name) for frame in frames]):
@@ -71,6 +63,6 @@ FORMAT = Format(
     "ScanNet++",
     "dslr/nerfstudio/transforms.json",
     find_scannetpp,
-    lambda path, given: parse_scannetpp(path, images=given.images),
+    parse_scannetpp,
     axes="opengl",
 )

@@ -17,7 +17,7 @@ from nerfcli.cameras.frame import Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import parse_colmap, read_model, write_colmap_binary
 from nerfcli.captures.formats.fields import read_json_object
-from nerfcli.captures.formats.format import Format, folder_with
+from nerfcli.captures.formats.format import Format, UserInputs, folder_with
 from nerfcli.captures.formats.photo_names import seen_from, with_photos
 from nerfcli.captures.holdout import default_split
 from nerfcli.captures.orientation import UPRIGHT
@@ -254,16 +254,16 @@ def _listed_bounds(content: dict[str, Any], path: Path) -> dict[str, tuple[float
     return bounds
 
 
-def parse_scene(path: Path, *, images: Path | None = None) -> Capture:
+def parse_scene(path: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the scene in a folder, with the photos of another folder if one is given.
 
     Raises:
         UserError: scene.json or the model is damaged.
     """
     described = read_description(path)
-    capture = parse_colmap(described.model_dir, images or described.image_folder)
+    capture = parse_colmap(described.model_dir, given.images or described.image_folder)
     there = described.image_folder if described.image_folder.is_dir() else None
-    capture = with_photos(capture, path, given=images or there)
+    capture = with_photos(capture, path, given=given.images or there)
     frames = described.described(capture.frames)
     return replace(
         capture,
@@ -354,7 +354,7 @@ FORMAT = Format(
     "a scene folder",
     SCENE_FILE,
     folder_with(SCENE_FILE),
-    lambda path, given: parse_scene(path, images=given.images),
+    parse_scene,
     files=SCENE_FILES,
     is_unordered=True,
     has_split=True,

@@ -16,11 +16,11 @@ import numpy as np
 from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, malformed, numbers, read_rows
-from nerfcli.captures.formats.format import Format, folder_with
+from nerfcli.captures.formats.format import Format, UserInputs, folder_with
 from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import GIVE_PHOTOS, FoundPhotos, find_photos
-from nerfcli.captures.orientation import measure, stored_size
+from nerfcli.captures.orientation import stored_size
 from nerfcli.errors import several
 from nerfcli.photos.video import open_video
 
@@ -33,21 +33,14 @@ _LENS = ("fx", "fy", "cx", "cy")
 _EXPECTED = "expected the table of Stray Scanner: timestamp, frame, x, y, z, qx, qy, qz, qw"
 
 
-def parse_stray_scanner(folder: Path, *, images: Path | None = None) -> Capture:
-    """Read the frames whose photo is on disk, or all frames if none is; the unit is the metre, by ARKit.
-
-    Args:
-        images: the folder of the photos; by default rgb/, images/ or frames/ beside the files.
-
-    Raises:
-        UserError: a file is damaged (file and line are named), or there are neither photos nor the video.
-    """
+def parse_stray_scanner(folder: Path, given: UserInputs = UserInputs()) -> Capture:
+    """Read the frames whose photo is on disk, or all frames if none is; the unit is the metre, by ARKit."""
     path = folder / ODOMETRY
     rows = _rows(path)
-    found = _photos(list(rows), folder, images)
+    found = _photos(list(rows), folder, given.images)
     there = [image for image in found.paths if image is not None]
     if there:
-        size = stored_size(there[0], measure)
+        size = stored_size(there[0])
     elif (path_of_video := video_of(folder)) is not None:
         video = open_video(path_of_video)
         size = video.width, video.height
@@ -120,6 +113,6 @@ FORMAT = Format(
     "Stray Scanner",
     ODOMETRY,
     folder_with(ODOMETRY, MATRIX),
-    lambda path, given: parse_stray_scanner(path, images=given.images),
+    parse_stray_scanner,
     video=video_of,
 )

@@ -20,7 +20,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.alicevision import find_alicevision
 from nerfcli.captures.formats.camera_path import find_camera_path
 from nerfcli.captures.formats.fields import check_unique_names, malformed, matrix, read_json_object
-from nerfcli.captures.formats.format import Format, find_json
+from nerfcli.captures.formats.format import Format, UserInputs, find_json
 from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos, seen_from
@@ -35,30 +35,22 @@ from nerfcli.captures.formats.transforms_cameras import (
     record_of_camera,
 )
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts
-from nerfcli.captures.orientation import Measure, measure, stored_size
+from nerfcli.captures.orientation import stored_size
 from nerfcli.errors import UserError, several
 from nerfcli.errors import listed as in_words
 
 SPLITS = ("train", "val", "test")
 
 
-def parse_transforms(path: Path, measure: Measure | None = None, *, images: Path | None = None) -> Capture:
+def parse_transforms(path: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read a transforms.json, whether or not its images exist; those without a known size are `missing`.
 
     Poses and points stay in the file's own world. nerfstudio's applied_transform and applied_scale say how that world
     came from the original world of the poses (COLMAP's). They are not undone, since the cameras would then no longer
     match the fields that were trained on the file.
-
-    Args:
-        path: the JSON file; paths in it are relative to its folder.
-        measure: returns an image's upright size and EXIF orientation; needed only if the file lacks `w` or `h`.
-        images: the folder of the images, if they are not where the file says.
-
-    Raises:
-        UserError: the file, or the PLY file of points that it names, is malformed or missing; file and field are named.
     """
     content = read_json_object(path)
-    frames, missing, notes = listed_frames(path, content, records_of(path, content), measure, images=images)
+    frames, missing, notes = listed_frames(path, content, records_of(path, content), images=given.images)
     check_unique_names((frame.name for frame in frames), path)
     points, colours, lost = _points_beside(path, content)
     return Capture(tuple(frames), points, tuple(missing), kind="transforms", colours=colours, notes=(*notes, *lost))
@@ -131,7 +123,6 @@ def listed_frames(
     path: Path,
     content: dict[str, Any],
     listed: Sequence[tuple[dict[str, Any], str]],
-    measure: Measure | None,
     *,
     suffix: str = "",
     images: Path | None = None,
@@ -141,12 +132,12 @@ def listed_frames(
 ) -> tuple[list[Frame], list[str], tuple[str, ...]]:
     """Return the frames of a file as listed, the names of images whose size is unknown, which have no frame, and notes.
 
-    Frames with equal intrinsics share one camera. Masks that are not on disk are left out.
+    Frames with equal intrinsics share one camera. Masks that are not on disk are left out. Where the file does not give
+    the size of images, they are measured. One that is not on disk gets the size of the others, if they all have the
+    same; if none has one, it is an error.
 
     Args:
         listed: the frames, see `records_of`.
-        measure: returns an image's size, if the file does not give it. An image that is not on disk either gets the
-            size of the other images, if they all have the same; if none has one, it is an error.
         suffix: appended to a file_path without a suffix if no such image is on disk, as the format does.
         images: the folder of the images, if they are not where the file says.
         size: of the images, if the file does not give it and none is on disk.
@@ -166,7 +157,7 @@ def listed_frames(
         for name, image in zip(found.names, found.paths, strict=True)
     ]
     places = [image or home / name for name, image in zip(names, found.paths, strict=True)]
-    known = _known_sizes(sizes, places, listed[0][1], measure=measure, default=size)
+    known = _known_sizes(sizes, places, listed[0][1], default=size)
     masks, lost_masks = _masks(path, listed, home, folders[1], photos=set(places))
     splits = _listed_splits(path, content)
     cameras: dict[Camera, Camera] = {}
@@ -217,15 +208,13 @@ def relative_path(frame: Frame, folder: Path) -> str:
 
 
 def _known_sizes(
-    given: list[Size | None], images: list[Path], where: str, *, measure: Measure | None, default: Size | None
+    given: list[Size | None], images: list[Path], where: str, *, default: Size | None
 ) -> list[Size | None]:
     """Return the width and height of each frame's picture, given, measured, or the only ones known; None if unknown."""
-    sizes = given
-    if measure is not None:
-        sizes = [
-            stored_size(image, measure) if size is None and image.is_file() else size
-            for size, image in zip(sizes, images, strict=True)
-        ]
+    sizes = [
+        stored_size(image) if size is None and image.is_file() else size
+        for size, image in zip(given, images, strict=True)
+    ]
     known = {size for size in sizes if size is not None} or ({default} if default else set[Size]())
     if not known:
         raise malformed(where, f"w and h are missing, and {images[0]} does not exist", "add the image, or w and h")
@@ -286,7 +275,7 @@ FORMAT = Format(
     "nerfstudio, instant-ngp",
     "transforms.json",
     find_transforms,
-    lambda path, given: parse_transforms(path, measure, images=given.images),
+    parse_transforms,
     axes="opengl",
     open_axes=True,
     open_centre=True,

@@ -18,10 +18,10 @@ from nerfcli.cameras.frame import Frame, SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import check_unique_names, name_of, numbers, read_text
-from nerfcli.captures.formats.format import Format, folder_with
+from nerfcli.captures.formats.format import Format, UserInputs, folder_with
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, find_photos
 from nerfcli.captures.formats.trajectories import MOST_AWAY_SECONDS, photos_at, timed_rows, tum_poses
-from nerfcli.captures.orientation import measure, stored_size
+from nerfcli.captures.orientation import stored_size
 from nerfcli.errors import UserError
 
 PHOTOS, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
@@ -38,15 +38,10 @@ _KINECT_SIZE = (640, 480)
 _CALIBRATIONS = ("calibration.txt", "calib.txt")
 
 
-def parse_tum_rgbd(folder: Path, *, camera: Camera | None = None, images: Path | None = None) -> Capture:
+def parse_tum_rgbd(folder: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the photos whose time is within that of the poses; poses are interpolated to it.
 
-    Args:
-        camera: of all photos, resized to them, instead of the sequence's own.
-        images: a folder of the photos, in which their paths or names are looked for instead.
-
-    Raises:
-        UserError: a file is damaged (file and line are named), no photo has a pose, or the camera is not known.
+    A camera that the user gives replaces the sequence's own.
     """
     path = folder / PHOTOS
     seconds, names = _files_in_time(path)
@@ -54,10 +49,10 @@ def parse_tum_rgbd(folder: Path, *, camera: Camera | None = None, images: Path |
     poses, lost = tum_poses(folder / TRUTH)
     times, bodies = [float(name) for name, _ in poses], np.stack([pose for _, pose in poses])
     kept, interpolated, unposed = photos_at(names, seconds, times, bodies, where=str(folder / TRUTH))
-    found = find_photos([names[index] for index in kept], [folder], given=images)
+    found = find_photos([names[index] for index in kept], [folder], given=given.images)
     there = [image for image in found.paths if image is not None]
-    size = stored_size(there[0], measure) if there else _KINECT_SIZE
-    camera = _own_camera(folder, size) if camera is None else camera.resized(*size)
+    size = stored_size(there[0]) if there else _KINECT_SIZE
+    camera = _own_camera(folder, size) if given.camera is None else given.camera.resized(*size)
     depths = _depths(folder, seconds)
     frames = tuple(
         Frame(name, camera, pose, image=place or folder / name, depth=depths[index])
@@ -109,7 +104,7 @@ FORMAT = Format(
     "a sequence of TUM RGB-D",
     "rgb.txt",
     folder_with(PHOTOS, TRUTH),
-    lambda path, given: parse_tum_rgbd(path, camera=given.camera, images=given.images),
+    parse_tum_rgbd,
     open_axes=True,
     open_centre=True,
 )
