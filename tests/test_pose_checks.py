@@ -165,7 +165,7 @@ def test_a_skipped_check_is_not_started(job: Job, tmp_path: Path):
 
 def test_a_result_that_is_not_finite_is_written_as_null(job: Job, monkeypatch: pytest.MonkeyPatch):
     infinite = dict.fromkeys(range(1, 9), math.inf)
-    monkeypatch.setattr(examine, "pose_blur_px", lambda model, **options: infinite)
+    monkeypatch.setattr(examine, "pose_blur_px", lambda *arguments: infinite)
     # There are no photos: their features are in the database already.
     monkeypatch.setattr(worker, "extract", lambda job, report: None)
     monkeypatch.setattr(worker, "mask_turning_object", lambda job, training: (job, None))

@@ -7,6 +7,7 @@ import synthetic_captures as synthetic
 from synthetic_captures import WIDE, Lens
 
 from nerfcli.cameras.alignment import align
+from nerfcli.poses.input.job import Solver
 from nerfcli.poses.judge.examine import pose_blur_px
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.intrinsics import choose_lenses, convert_camera
@@ -54,7 +55,7 @@ def started_from(model: pycolmap.Reconstruction, name: str) -> pycolmap.Reconstr
         simple = convert_camera(camera, name)
         camera.model = simple.model
         camera.params = simple.params.tolist()
-    held_out.adjust(started, threads=1)
+    held_out.adjust(started)
     return started
 
 
@@ -72,7 +73,7 @@ def camera_of(model: pycolmap.Reconstruction) -> pycolmap.Camera:
 )
 def test_the_lens_model_is_the_one_that_took_the_pictures(name: str, params: tuple[float, ...]):
     """Synthetic truth; no richer lens than the true one is kept, and the principal point stays at the centre."""
-    lenses = choose_lenses(started_from(ring_model(name, params), "SIMPLE_RADIAL"), seed=0, threads=1)
+    lenses = choose_lenses(started_from(ring_model(name, params), "SIMPLE_RADIAL"))
     camera = camera_of(lenses.model)
     assert camera.model.name == name
     assert (camera.principal_point_x, camera.principal_point_y) == (512.0, 384.0)
@@ -87,7 +88,7 @@ def test_the_lens_model_is_the_one_that_took_the_pictures(name: str, params: tup
 def test_a_principal_point_off_the_centre_is_found():
     """Synthetic truth: 1.5 % of the width off, recovered to two pixels."""
     noisy = ring_model("SIMPLE_RADIAL", (800.0, 527.0, 380.0, 0.05))
-    lenses = choose_lenses(started_from(noisy, "SIMPLE_RADIAL"), seed=0, threads=1)
+    lenses = choose_lenses(started_from(noisy, "SIMPLE_RADIAL"))
     assert camera_of(lenses.model).params[1:3] == pytest.approx((527.0, 380.0), abs=2.0)
     assert any(candidate.principal_point and candidate.kept for candidate in lenses.candidates)
 
@@ -95,7 +96,7 @@ def test_a_principal_point_off_the_centre_is_found():
 def test_a_fisheye_off_the_axis_is_found_from_a_fisheye():
     """Synthetic truth: simpler and richer fisheyes are compared first with the principal point at the centre."""
     noisy = ring_model("OPENCV_FISHEYE", (380.0, 380.0, 524.0, 380.0, 0.1, -0.05, 0.03, -0.02), points=(100, 400))
-    lenses = choose_lenses(started_from(noisy, "OPENCV_FISHEYE"), seed=0, threads=1)
+    lenses = choose_lenses(started_from(noisy, "OPENCV_FISHEYE"))
     assert camera_of(lenses.model).model.name == "OPENCV_FISHEYE"
     assert camera_of(lenses.model).params[:4] == pytest.approx((380.0, 380.0, 524.0, 380.0), abs=1.0)
 
@@ -108,7 +109,7 @@ def test_a_focal_length_that_flat_ground_from_above_leaves_open_stays_at_exif(ex
     ground = synthetic.wall(points, seed=seed, size=9.0)
     noisy = synthetic.observed_model(views, ground, noise_px=noise_px, seed=seed)
     focal_px = {} if exif is None else {1: exif}
-    lenses = choose_lenses(started_from(noisy, "SIMPLE_RADIAL"), seed=0, threads=1, exif_focal_px=focal_px)
+    lenses = choose_lenses(started_from(noisy, "SIMPLE_RADIAL"), exif_focal_px=focal_px)
     camera, certain = camera_of(lenses.model), lenses.uncertainty[1]
     assert certain["weak"]
     assert certain["focal_percent"] > 3
@@ -122,14 +123,14 @@ def test_a_focal_length_that_flat_ground_from_above_leaves_open_stays_at_exif(ex
 def test_intrinsics_that_are_given_stay():
     _, noisy = synthetic_model("SIMPLE_RADIAL", [1280.0, 527.0, 380.0, 0.05])
     camera_of(noisy).params = [1300.0, 512.0, 384.0, 0.04]
-    lenses = choose_lenses(noisy, seed=0, threads=1, fixed=[1])
+    lenses = choose_lenses(noisy, solver=Solver(fixed=(1,)))
     assert camera_of(lenses.model).params.tolist() == [1300.0, 512.0, 384.0, 0.04]
     assert lenses.candidates == []
 
 
 def test_a_named_model_stays():
     noisy = ring_model("RADIAL", (1000.0, 512.0, 384.0, 0.1, -0.2))
-    lenses = choose_lenses(started_from(noisy, "SIMPLE_RADIAL"), seed=0, threads=1, named=[1])
+    lenses = choose_lenses(started_from(noisy, "SIMPLE_RADIAL"), named=[1])
     assert camera_of(lenses.model).model.name == "SIMPLE_RADIAL"
     assert {candidate.model for candidate in lenses.candidates} == {"SIMPLE_RADIAL"}
 
@@ -157,7 +158,7 @@ def test_held_out_observations_are_a_tenth_and_off_by_the_noise():
 
 def test_residuals_measure_the_noise():
     _, noisy = synthetic_model("SIMPLE_RADIAL", [1280.0, 512.0, 384.0, 0.05], noise_px=0.8)
-    held_out.adjust(noisy, threads=1)
+    held_out.adjust(noisy)
     assert held_out.residual_deviation_px(noisy) == pytest.approx(0.8, rel=0.05)
 
 
@@ -166,9 +167,9 @@ def test_pose_blur_is_how_far_pictures_really_move():
     predicted, moved = [], []
     for seed in range(24):
         truth, noisy = synthetic_model("SIMPLE_RADIAL", [1280.0, 512.0, 384.0, 0.05], photos=8, points=120, seed=seed)
-        held_out.adjust(noisy, threads=1)
+        held_out.adjust(noisy)
         if seed < 3:
-            blur = pose_blur_px(noisy, threads=1)
+            blur = pose_blur_px(noisy)
             predicted.append([blur[image_id] for image_id in sorted(blur)])
         moved.append(_picture_motion(truth, noisy))
     ratio = np.mean(predicted, axis=0) / np.sqrt(np.mean(moved, axis=0))
@@ -202,9 +203,9 @@ def test_the_blur_grows_with_the_noise_and_does_not_depend_on_the_frame():
     blurs = []
     for noise_px in (0.5, 1.0):
         _, noisy = synthetic_model("SIMPLE_RADIAL", [1280.0, 512.0, 384.0, 0.05], noise_px=noise_px)
-        blurs.append(pose_blur_px(noisy, threads=1))
+        blurs.append(pose_blur_px(noisy))
     assert [blurs[1][i] / blurs[0][i] for i in sorted(blurs[0])] == pytest.approx([2.0] * 12, rel=0.1)
     turned = pycolmap.Reconstruction(noisy)
     turned.transform(pycolmap.Sim3d(7.0, pycolmap.Rotation3d(np.array([0.1, 2.0, -0.4])), np.array([3.0, 1.0, -8.0])))
-    again = pose_blur_px(turned, threads=1)
+    again = pose_blur_px(turned)
     assert [again[i] for i in sorted(again)] == pytest.approx([blurs[1][i] for i in sorted(again)], rel=1e-3)

@@ -151,7 +151,7 @@ def test_a_wrong_result_with_low_residuals_is_refused(solved: Solved):
     same, left_out = leave_out_contradicting(wrong, pairs)
     assert same is wrong
     assert left_out == {}
-    verdict = judge(wrong, pairs, turn=None, names={"00005.jpg": "kitchen 5.jpg"}, seed=0, threads=1)
+    verdict = judge(wrong, pairs, turn=None, names={"00005.jpg": "kitchen 5.jpg"})
     assert verdict.failures[0].kind == "the poses contradict the strongest matches"
     assert "verified matches between" in verdict.failures[0].evidence
 
@@ -440,7 +440,7 @@ def test_one_photo_that_contradicts_is_left_out(solved: Solved):
     assert set(left_out) == {10}
     assert left_out[10].startswith("contradicts the rest: its ")
     assert rest.num_reg_images() == 9
-    assert judge(rest, pairs, turn=None, names={}, seed=0, threads=1).accepted
+    assert judge(rest, pairs, turn=None, names={}).accepted
 
 
 def test_a_photo_far_from_all_others_is_left_out(solved: Solved):
@@ -524,7 +524,7 @@ def test_a_photo_placed_by_points_is_judged_with_what_holds_it(solved: Solved):
 
     def accepted(held: Sequence[VerifiedPair]) -> bool:
         evidence = [*rest, mistaken]
-        return judge(solved.model, evidence, turn=None, names={}, seed=0, threads=1, held=held).accepted
+        return judge(solved.model, evidence, turn=None, names={}, held=held).accepted
 
     assert not accepted([])
     assert accepted(held)

@@ -12,8 +12,10 @@ from in_this_process import poses_in_this_process
 from synthetic_captures import Lens
 
 from nerfcli.captures.loading import load_scene
+from nerfcli.poses.input.job import Solver
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.model import held_out
+from nerfcli.poses.model.lens_evidence import OwnCameras
 from nerfcli.poses.model.lens_observability import uncertainty
 from nerfcli.poses.model.principal_points import (
     LEAST_OBSERVATIONS,
@@ -45,7 +47,7 @@ def capture(shifts: np.ndarray, *, seed: int = 0, points: int = 500, wrong: floa
             if rng.uniform() < wrong:
                 angle = rng.uniform(0, 2 * np.pi)
                 point.xy = np.asarray(point.xy) + 100 * np.array([np.cos(angle), np.sin(angle)])
-    held_out.adjust(model, threads=1, robust_px=2.0 if wrong else None)
+    held_out.adjust(model, robust_px=2.0 if wrong else None)
     return model
 
 
@@ -61,7 +63,7 @@ def chosen(
     def report(stage: str, done: int, total: int) -> None:
         reports.append((stage, done, total))
 
-    found = choose_principal_points(model, seed=0, threads=1, report=report)
+    found = choose_principal_points(model, report=report)
     assert found.evidence is not None
     settling = [("settle", done, 4) for done in range(5)]
     assert reports == [
@@ -112,7 +114,7 @@ def test_free_principal_points_leave_the_focal_length_less_certain():
 
     def percent(shifting: list[int]) -> float:
         lens_of = dict.fromkeys(photos, 1)
-        return uncertainty(found, 1, principal_point=False, seed=0, lens_of=lens_of, shifting=shifting)["focal_percent"]
+        return uncertainty(found, 1, principal_point=False, own=OwnCameras(lens_of, shifting))["focal_percent"]
 
     assert percent([]) < 0.98 * certain[1]["focal_percent"]
     assert certain[1]["focal_percent"] < 0.999 * percent(photos)
@@ -151,7 +153,7 @@ def test_photos_with_one_principal_point_share_it(seed):
 
 def test_fixed_intrinsics_stay_as_they_are():
     model = capture(stabiliser(0))
-    assert choose_principal_points(model, seed=0, threads=1, fixed=[1]) == StabilisedModel(model, None, {})
+    assert choose_principal_points(model, solver=Solver(fixed=(1,))) == StabilisedModel(model, None, {})
 
 
 def test_a_photo_with_few_observations_keeps_the_shared_principal_point():
@@ -180,7 +182,7 @@ def test_a_principal_point_far_from_the_others_is_put_back():
 
 def test_too_few_photos_are_no_evidence():
     model = capture(stabiliser(0), points=60)
-    assert choose_principal_points(model, seed=0, threads=1) == StabilisedModel(model, None, {})
+    assert choose_principal_points(model) == StabilisedModel(model, None, {})
 
 
 def test_points_in_two_photos_alone_are_no_evidence():
@@ -193,7 +195,7 @@ def test_points_in_two_photos_alone_are_no_evidence():
     ]
     for observation in surplus:
         model.delete_observation(*observation)
-    assert choose_principal_points(model, seed=0, threads=1) == StabilisedModel(model, None, {})
+    assert choose_principal_points(model) == StabilisedModel(model, None, {})
 
 
 def test_a_model_with_own_cameras_projects_as_before():

@@ -134,7 +134,7 @@ def map_globally(job: Job) -> list[pycolmap.Reconstruction]:
 
 
 def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.IncrementalPipelineOptions:
-    seed, fixed = job.seed + attempt, set(job.fixed_cameras)
+    seed, fixed = job.seed + attempt, set(job.solver.fixed)
     with pycolmap.Database.open(job.database) as database:
         growth = _GROWTH[database.num_inlier_matches() > _DENSE * len(job.files)]
     options = pycolmap.IncrementalPipelineOptions(
@@ -212,7 +212,7 @@ def _run_mapper(
 def _adjust_fully(model: pycolmap.Reconstruction, job: Job, options: pycolmap.IncrementalPipelineOptions) -> None:
     """Triangulate a mapped model again and adjust it with all of its points until it converges, in place."""
     thorough = pycolmap.IncrementalPipelineOptions(
-        num_threads=job.threads, constant_cameras=set(job.fixed_cameras), ba_global_function_tolerance=1e-6
+        num_threads=job.threads, constant_cameras=set(job.solver.fixed), ba_global_function_tolerance=1e-6
     )
     with pycolmap.Database.open(job.database) as database:
         cache = pycolmap.DatabaseCache.create(

@@ -220,7 +220,7 @@ def _extend_part(
 ) -> list[pycolmap.Reconstruction]:
     """Adjust a consistent part, and extend it to the other photos without the suspects."""
     base = pycolmap.Reconstruction(part)
-    refine_model(base, threads=job.threads, fixed=job.fixed_cameras)
+    refine_model(base, job.solver)
     return _extend(base, suspects, job, report)
 
 

@@ -258,7 +258,7 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
         return result
     lens_of, finishing = lenses_of(model), checks()
     if chosen.examined.verdict.accepted:
-        choose = partial(choose_principal_points, seed=job.seed, threads=job.threads, fixed=job.fixed_cameras)
+        choose = partial(choose_principal_points, solver=job.solver)
         with _timed(seconds, "stabilisation"):
             found = finishing.run(
                 "principal points",

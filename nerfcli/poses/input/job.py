@@ -64,6 +64,15 @@ class WorkMask:
 
 
 @dataclass(frozen=True)
+class Solver:
+    """How a model is adjusted and judged: the seed of random choices, threads, ids of cameras with fixed intrinsics."""
+
+    seed: int = 0
+    threads: int = 1
+    fixed: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
 class Job:
     """Structure from motion of photos 0, 1, 2...
 
@@ -108,9 +117,10 @@ class Job:
         return Path(self.folder) / f"{self.variant}{'-' if self.variant else ''}{name}.json"
 
     @property
-    def fixed_cameras(self) -> list[int]:
-        """Ids of the cameras whose intrinsics are kept fixed; a camera's id is the position of its group, from 1."""
-        return [number for number, group in enumerate(self.groups, start=1) if group.fixed]
+    def solver(self) -> Solver:
+        """How models of these photos are adjusted; a camera's id is the position of its group, from 1."""
+        fixed = tuple(number for number, group in enumerate(self.groups, start=1) if group.fixed)
+        return Solver(self.seed, self.threads, fixed)
 
     @property
     def given_cameras(self) -> list[int]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from nerfcli.poses.input.job import Solver
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import Contradiction, strong_contradictions
 from nerfcli.poses.judge.parallax import RotationFit
@@ -72,15 +73,13 @@ class Verdict:
 def judge(
     model: pycolmap.Reconstruction,
     pairs: Sequence[VerifiedPair],
+    solver: Solver = Solver(),
     *,
     turn: RotationFit | None,
     names: Mapping[str, str],
-    seed: int,
-    threads: int,
     held: Sequence[VerifiedPair] = (),
     given: Collection[int] = (),
     determined: Collection[int] = (),
-    fixed: Sequence[int] = (),
     checks: Checks | None = None,
 ) -> Verdict:
     """Measure a model against the evidence and decide whether to accept it.
@@ -98,7 +97,7 @@ def judge(
     run = (Checks() if checks is None else checks).run
     found: list[PairAgreement] = run("agreement of pairs", lambda: agreements(model, pairs), otherwise=[])
     rotations: list[RotationError] = run(
-        "rotations of pairs", lambda: rotation_errors(model, pairs, seed=seed), otherwise=[]
+        "rotations of pairs", lambda: rotation_errors(model, pairs, seed=solver.seed), otherwise=[]
     )
     contradictions: list[Contradiction] = run(
         "contradictions", lambda: strong_contradictions(model, [*found, *agreements(model, held)]), otherwise=[]
@@ -109,7 +108,7 @@ def judge(
     focal = [_focal_measure(camera) for camera in _cameras_in_use(model) if not camera.is_spherical()]
     unused = run(
         "unused observations",
-        lambda: _held_out_measure(model, seed=seed, threads=threads, fixed=fixed),
+        lambda: _held_out_measure(model, solver),
         otherwise=_UNKNOWN_HELD_OUT,
     )
     counts = [model.image(photo).num_points3D for photo in model.reg_image_ids()] or [0]
@@ -193,12 +192,10 @@ def _focal_measure(camera: pycolmap.Camera) -> float:
     return camera.mean_focal_length() / max(camera.width, camera.height)
 
 
-def _held_out_measure(
-    model: pycolmap.Reconstruction, *, seed: int, threads: int, fixed: Sequence[int]
-) -> dict[str, Any]:
-    training, held = held_out.split(model, seed=seed)
+def _held_out_measure(model: pycolmap.Reconstruction, solver: Solver) -> dict[str, Any]:
+    training, held = held_out.split(model, seed=solver.seed)
     # The lens was chosen before; a principal point that was freed is not moved again.
-    held_out.adjust(training, threads=threads, fixed=fixed)
+    held_out.adjust(training, solver)
     errors = held_out.errors_px(training, held)
     return {
         "observations": len(errors),

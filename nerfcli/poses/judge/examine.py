@@ -18,7 +18,7 @@ import numpy as np
 import pycolmap
 
 from nerfcli.matching.graph import connected_groups
-from nerfcli.poses.input.job import Job
+from nerfcli.poses.input.job import Job, Solver
 from nerfcli.poses.judge.acceptance import Verdict, judge, nothing_placed
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import leave_out_contradicting, without_photos
@@ -92,24 +92,18 @@ def examine(
     verdict = judge(
         model,
         pairs,
+        job.solver,
         held=held,
         turn=turn,
         names=names,
-        seed=job.seed,
-        threads=job.threads,
         given=job.given_cameras,
         determined=[camera for camera, found in lenses.uncertainty.items() if focal_is_determined(found)],
-        fixed=job.fixed_cameras,
         checks=checks,
     )
     report("check", 3, 4)
     blur: dict[int, float] = {}
     if verdict.accepted and model.num_reg_images() <= 500:  # with more photos, the joint covariance takes minutes
-        blur = checks.run(
-            "pose uncertainty",
-            lambda: pose_blur_px(model, threads=job.threads, fixed=job.fixed_cameras),
-            otherwise=blur,
-        )
+        blur = checks.run("pose uncertainty", lambda: pose_blur_px(model, job.solver), otherwise=blur)
     report("check", 4, 4)
     # In one pass, since a photo's own name may contain the numbered name of another one.
     reasons = {
@@ -143,28 +137,20 @@ def _with_lenses(model: pycolmap.Reconstruction, job: Job) -> ModelLenses:
         for number, group in enumerate(job.groups, start=1)
         if group.focal_px is not None and group.focal_is_prior
     }
-    return choose_lenses(
-        model,
-        seed=job.seed,
-        threads=job.threads,
-        fixed=job.fixed_cameras,
-        named=named,
-        exif_focal_px=exif_focal_px,
-    )
+    return choose_lenses(model, job.solver, named=named, exif_focal_px=exif_focal_px)
 
 
-def pose_blur_px(model: pycolmap.Reconstruction, *, threads: int, fixed: Sequence[int] = ()) -> dict[int, float]:
+def pose_blur_px(model: pycolmap.Reconstruction, solver: Solver = Solver()) -> dict[int, float]:
     """Compute the root mean square motion of a typical point in each photo by one standard deviation of its pose.
 
     The noise of an observation is estimated from the residuals of the adjustment. Points and intrinsics are treated as
     uncertain too; the lens model is taken as chosen. Errors common to all photos, and errors that no lens model
-    describes, are not included. The model has converged and is not changed; the intrinsics of the cameras `fixed` are
-    taken to be exact. The result is by image id; empty if there is no covariance, since the model is not constrained in
-    all directions.
+    describes, are not included. The model has converged and is not changed; fixed intrinsics are taken to be exact. The
+    result is by image id; empty if there is no covariance, since the model is not constrained in all directions.
     """
     copy = pycolmap.Reconstruction(model)
     # The model has converged with robust errors, which differ little: the covariance needs no further convergence.
-    adjuster = held_out.adjust(copy, threads=threads, fixed=fixed, tolerance=1e-3)
+    adjuster = held_out.adjust(copy, solver, tolerance=1e-3)
     options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
     found = pycolmap.estimate_ba_covariance(options, copy, adjuster)
     photos = sorted(copy.reg_image_ids())

@@ -4,13 +4,13 @@ The mean reprojection error is measured on observations that were fitted. Observ
 well poses and intrinsics generalise; they are used to compare camera models and to accept results.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from nerfcli.poses.input.job import Solver
 from nerfcli.poses.model.projection import Array, across_edge, offsets_px
 
 # Beyond this, more observations cost time and change nothing; a part of the points is adjusted instead.
@@ -91,19 +91,17 @@ def drop_misfits(model: pycolmap.Reconstruction) -> None:
 
 def adjust(
     model: pycolmap.Reconstruction,
+    solver: Solver = Solver(),
     *,
-    threads: int,
     principal_points: bool = False,
     focal_lengths: bool = True,
     distortion: bool = True,
-    fixed: Sequence[int] = (),
     robust_px: float | None = None,
     tolerance: float = 1e-9,
 ) -> pycolmap.CeresBundleAdjuster:
     """Run bundle adjustment of a whole model in place until it converges; return the adjuster, for the covariance.
 
     Args:
-        fixed: ids of cameras whose intrinsics are kept fixed.
         robust_px: error from which observations are downweighted (Cauchy loss); None for squared errors.
         tolerance: the relative change of the cost per iteration at which it ends. The default is full convergence: of
             two models that are compared, neither must look better because it was adjusted longer.
@@ -114,7 +112,7 @@ def adjust(
         refine_focal_length=focal_lengths,
         refine_extra_params=distortion,
     )
-    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.num_threads = solver.threads
     options.ceres.solver_options.max_num_iterations = 200
     options.ceres.solver_options.function_tolerance = tolerance
     if robust_px is not None:
@@ -125,7 +123,7 @@ def adjust(
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
-    for camera_id in fixed:
+    for camera_id in solver.fixed:
         config.set_constant_cam_intrinsics(camera_id)
     # Points, not cameras, fix the gauge, so that every camera has a covariance.
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)

@@ -7,8 +7,8 @@ centre, is kept if it predicts these better by more than chance.
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 import pycolmap
 from scipy.optimize import least_squares
 
+from nerfcli.poses.input.job import Solver
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.lens_evidence import UndeterminedError, lenses_of, parameters_of
 from nerfcli.poses.model.lens_observability import (
@@ -67,10 +68,8 @@ class ModelLenses:
 
 def choose_lenses(
     model: pycolmap.Reconstruction,
+    solver: Solver = Solver(),
     *,
-    seed: int,
-    threads: int,
-    fixed: Sequence[int] = (),
     named: Sequence[int] = (),
     exif_focal_px: Mapping[int, float] | None = None,
 ) -> ModelLenses:
@@ -82,12 +81,14 @@ def choose_lenses(
         exif_focal_px: by camera id, the focal length to keep if the observations do not determine it.
     """
     photos = Counter(lenses_of(model).values())
-    cameras = sorted((c for c in photos if c not in fixed and photos[c] >= LEAST_PHOTOS), key=lambda c: -photos[c])
+    cameras = sorted(
+        (c for c in photos if c not in solver.fixed and photos[c] >= LEAST_PHOTOS), key=lambda c: -photos[c]
+    )
     candidates: list[Candidate] = []
     freed: list[int] = []
     held: dict[int, DeterminedLens] = {}
     result = pycolmap.Reconstruction(model)
-    held_out.adjust(result, threads=threads, fixed=fixed, tolerance=_TOLERANCE)
+    held_out.adjust(result, solver, tolerance=_TOLERANCE)
     for camera_id in cameras[:MOST_CAMERAS]:
         camera = result.cameras[camera_id]
         exif = (exif_focal_px or {}).get(camera_id)
@@ -96,13 +97,7 @@ def choose_lenses(
         if parameters_of(camera):
             try:
                 found = determine_lens(
-                    result,
-                    camera_id,
-                    mapped=model,
-                    seed=seed,
-                    fixed=fixed,
-                    named=camera_id in named,
-                    exif_focal_px=exif,
+                    result, camera_id, solver, mapped=model, named=camera_id in named, exif_focal_px=exif
                 )
             except (UndeterminedError, np.linalg.LinAlgError):
                 if not wide:
@@ -111,9 +106,7 @@ def choose_lenses(
             held[camera_id] = found
             continue
         if found is None or wide:
-            best, tried = _choose_by_held_out(
-                result, camera_id, named=camera_id in named, seed=seed, threads=threads, fixed=fixed
-            )
+            best, tried = _choose_by_held_out(result, camera_id, solver, named=camera_id in named)
             candidates.extend(tried)
             lens, free = best.model.cameras[camera_id], best.principal_point
         else:
@@ -122,23 +115,23 @@ def choose_lenses(
         _set_lens(camera, lens)
         freed += [camera_id] if free else []
     if held:
-        return _with_held(
-            model, held, seed=seed, threads=threads, fixed=fixed, named=named, exif_focal_px=exif_focal_px
-        )
+        again = partial(choose_lenses, named=named, exif_focal_px=exif_focal_px)
+        return _with_held(model, held, solver, choose=again)
     # pycolmap frees the principal points of all cameras or of none; if only some are free, they are adjusted first.
     everywhere = bool(freed) and len(freed) == len(photos)
     if freed and not everywhere:
-        held_out.adjust(result, threads=threads, principal_points=True, fixed=[c for c in photos if c not in freed])
-    refine_model(result, threads=threads, principal_points=everywhere, fixed=fixed)
+        others = replace(solver, fixed=tuple(c for c in photos if c not in freed))
+        held_out.adjust(result, others, principal_points=True)
+    refine_model(result, solver, principal_points=everywhere)
     strayed = [c for c in freed if not is_centred(result.cameras[c])]
     if strayed:
         for camera_id in strayed:
             camera = result.cameras[camera_id]
             camera.principal_point_x, camera.principal_point_y = camera.width / 2, camera.height / 2
-        refine_model(result, threads=threads, fixed=fixed)
+        refine_model(result, solver)
     certain = {
         camera_id: uncertainty(
-            result, camera_id, principal_point=camera_id in freed and camera_id not in strayed, seed=seed, fixed=fixed
+            result, camera_id, solver, principal_point=camera_id in freed and camera_id not in strayed
         )
         for camera_id in sorted(photos)[:MOST_CAMERAS]
     }
@@ -148,33 +141,30 @@ def choose_lenses(
 def _with_held(
     model: pycolmap.Reconstruction,
     held: Mapping[int, DeterminedLens],
+    solver: Solver,
     *,
-    seed: int,
-    threads: int,
-    fixed: Sequence[int],
-    named: Sequence[int],
-    exif_focal_px: Mapping[int, float] | None,
+    choose: Callable[[pycolmap.Reconstruction, Solver], ModelLenses],
 ) -> ModelLenses:
-    """Choose the lenses again, with the undetermined focal lengths held at their assumed values.
+    """Choose the lenses again by `choose`, with the undetermined focal lengths held at their assumed values.
 
     Only the distortion of these cameras is adjusted, and then fixed; or removed, if it is undetermined too.
     """
     start = pycolmap.Reconstruction(model)
     for camera_id, found in held.items():
         _set_lens(start.cameras[camera_id], found.camera)
-    held_out.adjust(start, threads=threads, focal_lengths=False, fixed=[c for c in start.cameras if c not in held])
+    others = replace(solver, fixed=tuple(c for c in start.cameras if c not in held))
+    held_out.adjust(start, others, focal_lengths=False)
     for camera_id in held:
-        if has_open_distortion(start, camera_id, seed=seed, fixed=[*fixed, *(c for c in held if c != camera_id)]):
+        rest = replace(solver, fixed=(*solver.fixed, *(c for c in held if c != camera_id)))
+        if has_open_distortion(start, camera_id, rest):
             camera = start.cameras[camera_id]
             kept = camera.params[:3].tolist()
             camera.model = pycolmap.CameraModelId.SIMPLE_PINHOLE
             camera.params = kept
-    chosen = choose_lenses(
-        start, seed=seed, threads=threads, fixed=[*fixed, *held], named=named, exif_focal_px=exif_focal_px
-    )
+    chosen = choose(start, replace(solver, fixed=(*solver.fixed, *held)))
     decided = [decision for found in held.values() for decision in found.steps]
     certain = {
-        camera_id: uncertainty(chosen.model, camera_id, principal_point=False, seed=seed, fixed=fixed)
+        camera_id: uncertainty(chosen.model, camera_id, solver, principal_point=False)
         for camera_id in held
         if camera_id in chosen.uncertainty
     }
@@ -186,15 +176,13 @@ def _set_lens(camera: pycolmap.Camera, lens: pycolmap.Camera) -> None:
     camera.params = lens.params.tolist()
 
 
-def refine_model(
-    model: pycolmap.Reconstruction, *, threads: int, principal_points: bool = False, fixed: Sequence[int] = ()
-) -> None:
+def refine_model(model: pycolmap.Reconstruction, solver: Solver, *, principal_points: bool = False) -> None:
     """Adjust a whole model in place, drop the observations that no longer fit, and adjust once more.
 
     The last adjustment is robust: highlights and moving things are seldom far enough off to be dropped, and are wrong
     in the same way in many photos; with squared errors, they would bias the lens.
     """
-    adjust = partial(held_out.adjust, model, threads=threads, principal_points=principal_points, fixed=fixed)
+    adjust = partial(held_out.adjust, model, solver, principal_points=principal_points)
     adjust(tolerance=_TOLERANCE)
     held_out.drop_misfits(model)
     scale_px = held_out.loss_scale_px(held_out.observation_errors_px(model))
@@ -247,14 +235,14 @@ def _field_by_exif_deg(camera: pycolmap.Camera, exif_focal_px: float | None) -> 
 
 
 def _choose_by_held_out(
-    model: pycolmap.Reconstruction, camera_id: int, *, named: bool, seed: int, threads: int, fixed: Sequence[int]
+    model: pycolmap.Reconstruction, camera_id: int, solver: Solver, *, named: bool
 ) -> tuple[_Trial, list[Candidate]]:
     """Adjust a model with one lens model of a camera after the other, each compared with the best one before it.
 
     The principal point comes before the tangential terms: both shift the picture, but real cameras have sensors off the
     axis, and that rotates the poses.
     """
-    training, held = held_out.split(model, seed=seed)
+    training, held = held_out.split(model, seed=solver.seed)
     mine = np.array([training.image(int(i)).camera_id == camera_id for i in held.images], dtype=bool)
     camera = training.cameras[camera_id]
     # None stands for the best one so far with its principal point free.
@@ -271,8 +259,8 @@ def _choose_by_held_out(
         if name is not None and camera.model.name != name:
             _set_lens(camera, convert_camera(camera, name))
         free = name is None or (best is not None and best.principal_point)
-        others = [c for c in trial.cameras if c != camera_id] if free else fixed
-        held_out.adjust(trial, threads=threads, principal_points=free, fixed=others)
+        others = tuple(c for c in trial.cameras if c != camera_id) if free else solver.fixed
+        held_out.adjust(trial, replace(solver, fixed=others), principal_points=free)
         errors = np.minimum(held_out.errors_px(trial, held)[mine], held_out.MOST_ERROR_PX)
         gain = None if best is None else held_out.gain(best.errors, errors)
         kept = best is None or bool(

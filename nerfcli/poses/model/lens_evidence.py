@@ -23,6 +23,7 @@ from scipy.cluster.vq import kmeans2
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
+from nerfcli.poses.input.job import Solver
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.held_out import MOST_OBSERVATIONS
 from nerfcli.poses.model.projection import Array, projected
@@ -36,6 +37,18 @@ _DAMPING = 1e-9
 
 class UndeterminedError(Exception):
     """A model has too few observations to determine its lens."""
+
+
+@dataclass(frozen=True)
+class OwnCameras:
+    """Photos with cameras of their own, which differ in the principal point.
+
+    lens_of: the lens of each photo, by image id. shifting: ids of the images whose principal points are free, as poses
+    are.
+    """
+
+    lens_of: Mapping[int, int]
+    shifting: Collection[int] = ()
 
 
 @dataclass(frozen=True)
@@ -121,33 +134,24 @@ class Estimate:
 def lens_evidence(
     model: pycolmap.Reconstruction,
     camera_id: int,
+    solver: Solver = Solver(),
     *,
-    seed: int,
-    fixed: Sequence[int] = (),
-    lens_of: Mapping[int, int] | None = None,
-    shifting: Collection[int] = (),
+    own: OwnCameras | None = None,
 ) -> LensEvidence:
     """Compute the evidence of a converged model's observations about a perspective camera.
 
     Observations are weighted as the robust adjustment does, see `held_out.adjust`.
 
-    Args:
-        camera_id: of the camera; of its lens with `lens_of`.
-        fixed: cameras whose intrinsics are exact.
-        lens_of: by image id, the lens of each photo, if photos have cameras of their own that differ in the principal
-            point.
-        shifting: ids of images whose principal points are free, as poses are.
+    `camera_id` is that of the lens where photos have cameras of their own.
 
     Raises:
         UndeterminedError: there are fewer observations than unknowns.
     """
-    if lens_of is None:
-        lens_of = lenses_of(model)
-    seen = _observations(model, lens_of, seed=seed)
-    others = [c for c in seen.cameras if c != camera_id and c not in fixed][:_MOST_OTHERS]
+    seen = _observations(model, lenses_of(model) if own is None else own.lens_of, seed=solver.seed)
+    others = [c for c in seen.cameras if c != camera_id and c not in solver.fixed][:_MOST_OTHERS]
     poses, points, lens, residuals = _jacobians(model, seen, camera_id, others=others)
-    if shifting:
-        moves = np.isin(seen.photos, [seen.images.index(image_id) for image_id in shifting])
+    if own is not None and own.shifting:
+        moves = np.isin(seen.photos, [seen.images.index(image_id) for image_id in own.shifting])
         moves &= (poses != 0).any(axis=(1, 2))  # of points that are projected
         poses = np.concatenate([poses, moves[:, None, None] * np.eye(2)], axis=2)
     rows, columns = len(residuals), lens.shape[2]
@@ -159,16 +163,16 @@ def lens_evidence(
     for array in (poses, points, lens):
         array *= root_weights[:, None, None]
     residuals = residuals * root_weights[:, None]
-    own = _freed(poses, points, lens, seen)
+    free = _freed(poses, points, lens, seen)
     # What the other cameras' lenses can explain is removed too, like that of the poses; these cameras are few.
     if others:
-        flat = own.reshape(2 * rows, columns)
+        flat = free.reshape(2 * rows, columns)
         first, rest = flat[:, : len(NAMES)], flat[:, len(NAMES) :]
-        own = (first - rest @ np.linalg.lstsq(rest, first, rcond=1e-10)[0]).reshape(rows, 2, len(NAMES))
-    scores = np.einsum("nij,ni->nj", own, residuals)
-    products = np.einsum("nij,nik->njk", own, own)
-    clusters = (seen.photos, _scene_clusters(seen, seed=seed))
-    camera = camera_of(model, camera_id, lens_of)
+        free = (first - rest @ np.linalg.lstsq(rest, first, rcond=1e-10)[0]).reshape(rows, 2, len(NAMES))
+    scores = np.einsum("nij,ni->nj", free, residuals)
+    products = np.einsum("nij,nik->njk", free, free)
+    clusters = (seen.photos, _scene_clusters(seen, seed=solver.seed))
+    camera = camera_of(model, camera_id, own)
     return LensEvidence(
         current=lens_values(camera),
         information=products.sum(axis=0),
@@ -185,11 +189,11 @@ def lenses_of(model: pycolmap.Reconstruction) -> dict[int, int]:
     return {image_id: model.image(image_id).camera_id for image_id in model.reg_image_ids()}
 
 
-def camera_of(model: pycolmap.Reconstruction, lens: int, lens_of: Mapping[int, int] | None = None) -> pycolmap.Camera:
-    """Return the camera of a lens's first photo; `lens_of` as for `lens_evidence`."""
-    if lens_of is None:
+def camera_of(model: pycolmap.Reconstruction, lens: int, own: OwnCameras | None = None) -> pycolmap.Camera:
+    """Return the camera of a lens's first photo."""
+    if own is None:
         return model.camera(lens)
-    return model.camera(model.image(next(photo for photo, number in lens_of.items() if number == lens)).camera_id)
+    return model.camera(model.image(next(photo for photo, number in own.lens_of.items() if number == lens)).camera_id)
 
 
 def parameters_of(camera: pycolmap.Camera) -> tuple[str, ...]:

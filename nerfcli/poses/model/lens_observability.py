@@ -6,7 +6,7 @@ observations clearly support another value, judged by photos and by parts of the
 length that they do not determine stays at EXIF's.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,10 +15,12 @@ import pycolmap
 from scipy.special import chdtri
 
 from nerfcli.photos.focal_evidence import usual_focal_px
+from nerfcli.poses.input.job import Solver
 from nerfcli.poses.model.lens_evidence import (
     NAMES,
     Estimate,
     LensEvidence,
+    OwnCameras,
     UndeterminedError,
     camera_of,
     camera_with,
@@ -91,10 +93,9 @@ class DeterminedLens:
 def determine_lens(
     model: pycolmap.Reconstruction,
     camera_id: int,
+    solver: Solver = Solver(),
     *,
     mapped: pycolmap.Reconstruction,
-    seed: int,
-    fixed: Sequence[int] = (),
     named: bool = False,
     exif_focal_px: float | None = None,
 ) -> DeterminedLens:
@@ -109,7 +110,7 @@ def determine_lens(
         UndeterminedError: the model has too few observations.
     """
     camera = model.cameras[camera_id]
-    evidence = lens_evidence(model, camera_id, seed=seed, fixed=fixed)
+    evidence = lens_evidence(model, camera_id, solver)
 
     def decision(names: Sequence[str], distance: float | None, *, taken: bool) -> Candidate:
         name = camera.model.name if named else _model_name(names)
@@ -130,7 +131,7 @@ def determine_lens(
     # If the focal length is undetermined, so is distortion: neither can be estimated without the other.
     fraction = found.deviation("f") / camera.mean_focal_length()
     if not named and not fraction <= (_OPEN_DEVIATION if exif_focal_px is None else _EXIF_DEVIATION):
-        focal_px = exif_focal_px or _between_px(mapped, camera_id, seed=seed, fixed=fixed)
+        focal_px = exif_focal_px or _between_px(mapped, camera_id, solver)
         return DeterminedLens(_held(mapped.cameras[camera_id], focal_px), False, True, tuple(steps))
     if not named and "k2" not in free and fraction <= _EXIF_DEVIATION:
         distance = found.distance(["k1"]) / float(chdtri(1, _CHANCE))
@@ -142,27 +143,18 @@ def determine_lens(
     return DeterminedLens(_camera(camera, found, named=named), "cx" in free, False, tuple(steps))
 
 
-def refine_lens(
-    model: pycolmap.Reconstruction,
-    lens: int,
-    *,
-    lens_of: Mapping[int, int],
-    shifting: Collection[int],
-    seed: int,
-    fixed: Sequence[int] = (),
-) -> pycolmap.Camera | None:
+def refine_lens(model: pycolmap.Reconstruction, lens: int, own: OwnCameras, solver: Solver) -> pycolmap.Camera | None:
     """Return a lens as the observations determine it if photos have principal points of their own: one Newton step.
 
-    The arguments are those of `lens_evidence`; each photo of the model has a camera of its own. Returns the camera of
-    the lens's first photo with these parameters, with its principal point; None if the observations do not determine
-    them, or the lens cannot be examined in this way.
+    Returns the camera of the lens's first photo with these parameters, with its principal point; None if the
+    observations do not determine them, or the lens cannot be examined in this way.
     """
-    camera = camera_of(model, lens, lens_of)
+    camera = camera_of(model, lens, own)
     free = parameters_of(camera)
-    if not free or lens in fixed:
+    if not free or lens in solver.fixed:
         return None
     try:
-        evidence = lens_evidence(model, lens, seed=seed, fixed=fixed, lens_of=lens_of, shifting=shifting)
+        evidence = lens_evidence(model, lens, solver, own=own)
         return _camera(camera, evidence.estimate(free), named=True)
     except (UndeterminedError, np.linalg.LinAlgError):
         return None
@@ -171,16 +163,12 @@ def refine_lens(
 def uncertainty(
     model: pycolmap.Reconstruction,
     camera_id: int,
+    solver: Solver = Solver(),
     *,
     principal_point: bool,
-    seed: int,
-    fixed: Sequence[int] = (),
-    lens_of: Mapping[int, int] | None = None,
-    shifting: Collection[int] = (),
+    own: OwnCameras | None = None,
 ) -> dict[str, Any]:
     """Compute the uncertainty of the intrinsics of a camera, one standard deviation each, for the report.
-
-    `lens_of` and `shifting` are those of `lens_evidence`.
 
     Returns:
         {"focal_percent", "principal_point_px": its uncertainty if it were free, "principal_point_free",
@@ -188,16 +176,16 @@ def uncertainty(
         whether focal length or distortion are uncertain enough for a warning, "reason": None}. If the lens cannot be
         examined in this way or the observations are too few, "reason" says so and the numbers and "weak" are None.
     """
-    camera = camera_of(model, camera_id, lens_of)
+    camera = camera_of(model, camera_id, own)
     nothing = {"focal_percent": None, "principal_point_px": None, "distortion_border_px": None}
     nothing |= {"principal_point_free": principal_point, "weak": None}
     free = parameters_of(camera)
-    if camera_id in fixed:
+    if camera_id in solver.fixed:
         return nothing | {"reason": "the intrinsics are given"}
     if not free:
         return nothing | {"reason": f"not supported for {camera.model.name}"}
     try:
-        evidence = lens_evidence(model, camera_id, seed=seed, fixed=fixed, lens_of=lens_of, shifting=shifting)
+        evidence = lens_evidence(model, camera_id, solver, own=own)
         found = evidence.estimate([*free, *(_PRINCIPAL_POINT if principal_point else ())])
         freed = evidence.estimate([*free, *_PRINCIPAL_POINT])
     except (UndeterminedError, np.linalg.LinAlgError) as error:
@@ -238,12 +226,12 @@ def _relative_distance(
     return found.distance(group) / float(chdtri(len(group), _CHANCE))
 
 
-def _between_px(mapped: pycolmap.Reconstruction, camera_id: int, *, seed: int, fixed: Sequence[int]) -> float:
+def _between_px(mapped: pycolmap.Reconstruction, camera_id: int, solver: Solver) -> float:
     """Return the mean of a mapped model's focal length and a usual one, weighted by uncertainty (in logarithms)."""
     camera = mapped.cameras[camera_id]
     focal_px, usual_px = camera.mean_focal_length(), usual_focal_px(camera.width, camera.height)
     try:
-        found = lens_evidence(mapped, camera_id, seed=seed, fixed=fixed).estimate(parameters_of(camera))
+        found = lens_evidence(mapped, camera_id, solver).estimate(parameters_of(camera))
     except (UndeterminedError, np.linalg.LinAlgError):
         return usual_px
     weights = np.array([found.deviation("f") / focal_px, _UNKNOWN_DEVIATION]) ** -2.0
@@ -261,13 +249,11 @@ def _held(camera: pycolmap.Camera, focal_px: float) -> pycolmap.Camera:
     return held
 
 
-def has_open_distortion(
-    model: pycolmap.Reconstruction, camera_id: int, *, seed: int, fixed: Sequence[int] = ()
-) -> bool:
+def has_open_distortion(model: pycolmap.Reconstruction, camera_id: int, solver: Solver) -> bool:
     """Return whether a camera's one distortion term is neither significant nor harmless at its current focal length."""
     camera = model.cameras[camera_id]
     try:
-        evidence = lens_evidence(model, camera_id, seed=seed, fixed=fixed)
+        evidence = lens_evidence(model, camera_id, solver)
         found = evidence.estimate(["k1"])
     except (UndeterminedError, np.linalg.LinAlgError):
         return True

@@ -126,7 +126,7 @@ def locate_photos(
         report("locate", total, total)
     pairs = read_verified_pairs(job.database, min_matches=FEW_MATCHES)
     if any(not attempt.refused for attempt in attempts.values()):
-        refine_model(grown, threads=job.threads, fixed=job.fixed_cameras)
+        refine_model(grown, job.solver)
     for image_id in (image_id for image_id, attempt in attempts.items() if not attempt.refused):
         if doubt := _doubt(grown, image_id, pairs):
             grown.deregister_frame(grown.image(image_id).frame_id)

@@ -190,7 +190,7 @@ def _join(
             owners = dict.fromkeys(moved.reg_image_ids(), number) | owners
             _add(joined, moved, {photo for photo, owner in owners.items() if owner == number})
         _merge_tracks(joined, cache)
-        held_out.adjust(joined, threads=job.threads, fixed=job.fixed_cameras, tolerance=_TOLERANCE)
+        held_out.adjust(joined, job.solver, tolerance=_TOLERANCE)
         held_out.drop_misfits(joined)
         agreeing = [
             _agreeing_fraction(joined, {photo for photo, owner in owners.items() if owner == number}, pairs)
@@ -236,9 +236,9 @@ def _triangulated_again(model: pycolmap.Reconstruction, job: Job, *, output: Pat
         output,
         clear_points=True,
         options=options,
-        refine_intrinsics=not job.fixed_cameras,
+        refine_intrinsics=not job.solver.fixed,
     )
-    refine_model(model, threads=job.threads, fixed=job.fixed_cameras)
+    refine_model(model, job.solver)
     return model
 
 

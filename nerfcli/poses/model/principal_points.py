@@ -6,8 +6,8 @@ from the centre, no pose can describe: for a shift of one degree in a picture of
 these are 5 pixels at the border.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,10 @@ import pycolmap
 from scipy.optimize import least_squares
 
 from nerfcli.cameras.rigid import transform_from_twist
-from nerfcli.poses.input.job import Report
+from nerfcli.poses.input.job import Report, Solver
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.intrinsics import DEVIATIONS, LEAST_PHOTOS, MOST_CAMERAS
-from nerfcli.poses.model.lens_evidence import lenses_of
+from nerfcli.poses.model.lens_evidence import OwnCameras, lenses_of
 from nerfcli.poses.model.lens_observability import PRINCIPAL_POINT_RANGE, refine_lens, uncertainty
 from nerfcli.poses.model.locate import pixels_of, place
 from nerfcli.poses.model.projection import Array, projected
@@ -67,10 +67,8 @@ class StabilisedModel:
 
 def choose_principal_points(
     model: pycolmap.Reconstruction,
+    solver: Solver = Solver(),
     *,
-    seed: int,
-    threads: int,
-    fixed: Sequence[int] = (),
     report: Report = lambda stage, done, total: None,
 ) -> StabilisedModel:
     """Return the model with a camera for each photo if their principal points differ, else the model as it is.
@@ -80,16 +78,16 @@ def choose_principal_points(
     points differ.
     """
     report("stabilise", 0, 2)
-    shared, held = held_out.split(model, seed=seed)
-    free = _free_photos(shared, fixed)
+    shared, held = held_out.split(model, seed=solver.seed)
+    free = _free_photos(shared, solver)
     if len(free) < LEAST_PHOTOS or len(held.points) == 0:
         report("stabilise", 2, 2)
         return StabilisedModel(model, None, {})
     scale_px = held_out.loss_scale_px(held_out.observation_errors_px(shared))
-    _adjust(shared, set(), threads=threads, robust_px=scale_px)
+    _adjust(shared, set(), solver, robust_px=scale_px)
     report("stabilise", 1, 2)
     own = give_own_cameras(shared)
-    _adjust(own, free, threads=threads, robust_px=scale_px)
+    _adjust(own, free, solver, robust_px=scale_px)
     before, after = held_out.errors_px(shared, held), held_out.errors_px(own, held)
     most = _CLIP * float(np.median(before))
     before, after = np.minimum(before, most), np.minimum(after, most)
@@ -99,7 +97,7 @@ def choose_principal_points(
     if not kept:
         report("stabilise", 2, 2)
         return StabilisedModel(model, evidence, {})
-    return _settled(model, evidence, seed=seed, threads=threads, fixed=fixed, report=report)
+    return _settled(model, evidence, solver, report)
 
 
 def give_own_cameras(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
@@ -151,34 +149,27 @@ def refine_with_principal_point(
 
 
 def _settled(
-    model: pycolmap.Reconstruction,
-    evidence: PrincipalPoints,
-    *,
-    seed: int,
-    threads: int,
-    fixed: Sequence[int],
-    report: Report,
+    model: pycolmap.Reconstruction, evidence: PrincipalPoints, solver: Solver, report: Report
 ) -> StabilisedModel:
     """Adjust the model with own principal points, and drop the observations that no longer fit."""
     report("settle", 0, 1 + _ROUNDS)
     own, lens_of = give_own_cameras(model), lenses_of(model)
-    free, held = _free_photos(model, fixed), set[int]()
+    free, held = _free_photos(model, solver), set[int]()
     scale_px = held_out.loss_scale_px(held_out.observation_errors_px(own))
-    _adjust(own, free, threads=threads, robust_px=scale_px, tolerance=_TOLERANCE)
+    _adjust(own, free, solver, robust_px=scale_px, tolerance=_TOLERANCE)
     for number in range(_ROUNDS):
         report("settle", 1 + number, 1 + _ROUNDS)
         # Before cameras move: poses and points have not followed yet.
         scale_px = held_out.loss_scale_px(held_out.observation_errors_px(own))
         held = _anchored(own, model, free)
         if number > 0:
-            _move_lenses(own, lens_of, shifting=free - held, seed=seed, fixed=fixed)
-        _adjust(own, free - held, threads=threads, robust_px=scale_px, tolerance=_TOLERANCE)
+            _move_lenses(own, OwnCameras(lens_of, free - held), solver)
+        _adjust(own, free - held, solver, robust_px=scale_px, tolerance=_TOLERANCE)
     report("settle", 1 + _ROUNDS, 1 + _ROUNDS)
     held_out.drop_misfits(own)
+    of_photos = OwnCameras(lens_of, free - held)
     certain = {
-        lens: uncertainty(
-            own, lens, principal_point=False, seed=seed, fixed=fixed, lens_of=lens_of, shifting=free - held
-        )
+        lens: uncertainty(own, lens, solver, principal_point=False, own=of_photos)
         for lens in sorted(set(lens_of.values()))[:MOST_CAMERAS]
     }
     return StabilisedModel(own, evidence, certain)
@@ -207,45 +198,39 @@ def _anchored(own: pycolmap.Reconstruction, model: pycolmap.Reconstruction, free
     return held
 
 
-def _move_lenses(
-    own: pycolmap.Reconstruction,
-    lens_of: Mapping[int, int],
-    *,
-    shifting: set[int],
-    seed: int,
-    fixed: Sequence[int],
-) -> None:
+def _move_lenses(own: pycolmap.Reconstruction, of_photos: OwnCameras, solver: Solver) -> None:
     """Take a step of focal lengths and distortions, which shared principal points have biased, in place."""
-    for lens in sorted(set(lens_of.values())):
-        found = refine_lens(own, lens, lens_of=lens_of, shifting=shifting, seed=seed, fixed=fixed)
+    for lens in sorted(set(of_photos.lens_of.values())):
+        found = refine_lens(own, lens, of_photos, solver)
         if found is None:
             continue
         kept = [*found.focal_length_idxs(), *found.extra_params_idxs()]
-        for photo in (image_id for image_id, number in lens_of.items() if number == lens):
+        for photo in (image_id for image_id, number in of_photos.lens_of.items() if number == lens):
             params = np.array(own.cameras[photo].params)
             params[kept] = np.array(found.params)[kept]
             own.cameras[photo].params = params.tolist()
 
 
 def _adjust(
-    model: pycolmap.Reconstruction, free: set[int], *, threads: int, robust_px: float, tolerance: float = 1e-9
+    model: pycolmap.Reconstruction, free: set[int], solver: Solver, *, robust_px: float, tolerance: float = 1e-9
 ) -> None:
     """Adjust poses, points and the principal points of the photos in `free`, which have cameras of their own."""
     held_out.adjust(
         model,
-        threads=threads,
+        replace(solver, fixed=tuple(sorted(set(model.cameras) - free))),
         principal_points=bool(free),
         focal_lengths=False,
         distortion=False,
-        fixed=sorted(set(model.cameras) - free),
         robust_px=robust_px,
         tolerance=tolerance,
     )
 
 
-def _free_photos(model: pycolmap.Reconstruction, fixed: Sequence[int]) -> set[int]:
+def _free_photos(model: pycolmap.Reconstruction, solver: Solver) -> set[int]:
     """Return the ids of images with enough observations for a principal point, without those of fixed cameras."""
     images = [model.image(image_id) for image_id in model.reg_image_ids()]
     return {
-        image.image_id for image in images if image.camera_id not in fixed and image.num_points3D >= LEAST_OBSERVATIONS
+        image.image_id
+        for image in images
+        if image.camera_id not in solver.fixed and image.num_points3D >= LEAST_OBSERVATIONS
     }
