@@ -123,34 +123,6 @@ def test_bearings_turn_as_pixels_move(model, seed):
         )
 
 
-def test_footprint_of_a_fisheye_is_sinc_over_f_squared_behind_the_camera_too():
-    camera = Camera("SIMPLE_FISHEYE", 1000, 1000, (200.0, 500.0, 500.0))
-    angle = np.radians([0.0, 1e-6, 1.0, 45.0, 90.0, 120.0, 170.0])
-    footprint, valid = camera.pixel_footprint(np.stack([500 + 200 * angle, np.full(7, 500)], axis=1))
-    assert valid.all()
-    np.testing.assert_allclose(footprint, np.sinc(angle / np.pi) / 200**2, rtol=1e-12)
-
-
-@pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "SIMPLE_FISHEYE", "SIMPLE_DIVISION", "EUCM"])
-def test_the_footprints_of_a_picture_add_up_to_its_solid_angle(model):
-    """4 pi all around; 2 pi (1 - cos a) for a cap out to the angle a, to the error of pixels cut by the rim."""
-    size, centre = 600, 300.0
-    if model == "EQUIRECTANGULAR":
-        camera, expected = Camera(model, size, size // 2, (size, size // 2)), 4 * np.pi
-    else:
-        extra = {"SIMPLE_FISHEYE": (), "SIMPLE_DIVISION": (-0.3,), "EUCM": (0.55, 1.1)}[model]
-        focal = (150.0, 150.0) if model == "EUCM" else (150.0,)
-        camera = Camera(model, size, size, (*focal, centre, centre, *extra))
-        rim, _ = camera.bearings(np.array([[centre + 290.0, centre]]))
-        expected = 2 * np.pi * (1 - rim[0, 2])
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
-    inside = (np.hypot(*(pixels - centre).T) < 290) | camera.is_spherical
-    footprint, valid = camera.pixel_footprint(pixels)
-    assert valid[inside].all()
-    np.testing.assert_allclose(footprint[inside].sum(), expected, rtol=3e-4)
-
-
 @pytest.mark.parametrize("model", MODELS)
 def test_derivatives_are_finite_and_zero_where_nothing_is_seen(model):
     camera = random_camera(model, np.random.default_rng(1))
@@ -164,9 +136,9 @@ def test_derivatives_are_finite_and_zero_where_nothing_is_seen(model):
     assert valid[5]
     np.testing.assert_array_equal(by_point[~valid], 0)
     np.testing.assert_array_equal(by_parameters[~valid], 0)
-    footprint, valid = camera.pixel_footprint(np.array([[np.nan, 0], [1e300, 0], [600, 450]]))
-    assert np.isfinite(footprint).all()
-    np.testing.assert_array_equal(footprint[~valid], 0)
+    by_pixel, valid = camera.bearing_jacobian(np.array([[np.nan, 0], [1e300, 0], [600, 450]]))
+    assert np.isfinite(by_pixel).all()
+    np.testing.assert_array_equal(by_pixel[~valid], 0)
     assert not valid[0]
     assert valid[2]
     assert camera.project_jacobian(np.zeros((0, 3)))[1].shape == (0, 2, len(camera.params))

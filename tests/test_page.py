@@ -75,7 +75,7 @@ def rough(field: Field, *, sky: bool = False) -> Model:
 
 
 def page_of(model: Model, frames: list[Frame], proof: Proof) -> str:
-    photos = PagePhotos([], 0, 0)
+    photos = PagePhotos([], 0)
     numbers = PageNumbers.of(pack_model(model), proof, UNSEEN)
     box = (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
     scene = scene_of(model, run=Path("a-run"), frames=frames, photos=photos.entries, box=box)

@@ -63,7 +63,7 @@ def frames_at(centres: np.ndarray) -> list[Frame]:
 def test_a_capture_is_scaled_to_metres():
     capture = Capture(tuple(frames_at(np.array([[1.0, 2, 3]]))), np.array([[1.0, 1, 1]]), (), None, "colmap")
     estimate = ScaleEstimate(2.5, 0.01, (("a", 3.0), ("b", -4.0)), "percent", "2 known distances")
-    metric = transformed(capture, estimate.similarity)
+    metric = transformed(capture, Similarity(estimate.metres_per_unit, np.eye(3), np.zeros(3)))
     np.testing.assert_array_equal(metric.points, [[2.5, 2.5, 2.5]])
     np.testing.assert_array_equal(metric.frames[0].centre, [2.5, 5, 7.5])
     assert estimate.to_json() == {

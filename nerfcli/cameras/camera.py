@@ -197,25 +197,17 @@ class Camera:
 
         It is the inverse of d pixel / d direction on the plane normal to the direction: J^T (J J^T)^-1.
         """
+        directions, valid = self.bearings(pixels)
+        by_direction, _, smooth = self.project_jacobian(directions)
+        valid &= smooth
+        by_direction[~valid] = np.eye(2, 3)
         # With the rows a and b of J: (|b|^2 a - (a.b) b, |a|^2 b - (a.b) a) / |a x b|^2.
-        a, b, valid = self._rows_by_direction(pixels)
+        a, b = by_direction[:, 0], by_direction[:, 1]
         mixed = (a * b).sum(axis=1, keepdims=True)
         area = (np.cross(a, b) ** 2).sum(axis=1, keepdims=True)
         by_x = ((b * b).sum(axis=1, keepdims=True) * a - mixed * b) / area
         by_y = ((a * a).sum(axis=1, keepdims=True) * b - mixed * a) / area
         return np.stack([by_x, by_y], axis=-1) * valid[:, None, None], valid
-
-    def pixel_footprint(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the solid angle that each of the pixels (N, 2) covers, evaluated at its centre.
-
-        It is 1 / |a x b|, with a and b the rows of d pixel / d direction. A cone of the same solid angle has the radius
-        sqrt(footprint / pi) at distance 1.
-
-        Returns:
-            solid angles (N,) in steradians; valid (N,) bool as in `bearings`. Zero where not valid.
-        """
-        a, b, valid = self._rows_by_direction(pixels)
-        return valid / np.linalg.norm(np.cross(a, b), axis=1), valid
 
     def pixel_bearings(self) -> tuple[np.ndarray, np.ndarray]:
         """Return `bearings` of all pixel centres by rows: directions (height * width, 3), valid (height * width,)."""
@@ -282,14 +274,6 @@ class Camera:
                 'expected {"model": COLMAP\'s name, "width": pixels, "height": pixels, "params": [numbers]}',
             ) from error
         return Camera(model, width, height, params)
-
-    def _rows_by_direction(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the rows of d pixel / d direction, (N, 3) twice, unit vectors where not valid; valid (N,) bool."""
-        directions, valid = self.bearings(pixels)
-        by_direction, _, smooth = self.project_jacobian(directions)
-        valid &= smooth
-        by_direction[~valid] = np.eye(2, 3)
-        return by_direction[:, 0], by_direction[:, 1], valid
 
     def _opening_deg(self, pixels: np.ndarray) -> float:
         directions, valid = self.bearings(pixels)

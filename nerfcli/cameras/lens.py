@@ -82,7 +82,7 @@ class Lens:
             valid = self.projection.sees(directions)
             plane = self.projection.plane(_where_seen(directions, valid))
             for distortion in self.distortions:
-                valid = valid & _within(plane, distortion.reach)
+                valid = valid & (np.sqrt(plane[0] ** 2 + plane[1] ** 2) < distortion.reach)
                 plane = distortion.apply(plane)
             pixels = plane * self.focal_px + self.principal_point
         valid = valid & np.isfinite(pixels).all(axis=0)
@@ -160,7 +160,3 @@ def lens_of(model: str, values: dict[str, float]) -> Lens:
 def _where_seen(directions: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Return the directions, with those that are not seen replaced by the optical axis."""
     return np.where(seen, directions, np.array([[0.0], [0.0], [1.0]]))
-
-
-def _within(plane: np.ndarray, reach: float) -> np.ndarray:
-    return np.sqrt(plane[0] ** 2 + plane[1] ** 2) < reach

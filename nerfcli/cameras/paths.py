@@ -225,10 +225,8 @@ def ellipse(frames: Sequence[Frame], *, count: int, depth_hint: float | None = N
     return _looking_at(frames, _equal_steps(curve, count), focus, up=up, name="ellipse")
 
 
-def spiral(
-    frames: Sequence[Frame], *, count: int, turns: int = 2, depth_hint: float | None = None
-) -> tuple[Frame, ...]:
-    """Return a closed spiral about the mean camera, within the cameras' bounding box.
+def spiral(frames: Sequence[Frame], *, count: int, depth_hint: float | None = None) -> tuple[Frame, ...]:
+    """Return a closed spiral of two turns about the mean camera, within the cameras' bounding box.
 
     All views look at a point straight ahead of the mean camera, as deep as the focus or at least 2 |radii|. If the
     cameras surround the scene, their mean would be inside it, so only the quarter nearest to the middle frame is used.
@@ -251,7 +249,7 @@ def spiral(
     radii = _INSIDE * np.minimum(local.max(axis=0), -local.min(axis=0)).clip(min=0.0)
 
     def curve(t: np.ndarray) -> np.ndarray:
-        angle = 2 * np.pi * turns * t
+        angle = 4 * np.pi * t
         return np.stack([np.cos(angle), np.sin(angle), np.sin(2 * np.pi * t)], axis=-1) * radii
 
     path = middle + _equal_steps(curve, count) @ axes.T

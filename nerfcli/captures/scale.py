@@ -17,7 +17,6 @@ import numpy as np
 from nerfcli.cameras.alignment import align, align_robustly
 from nerfcli.cameras.frame import Frame, frames_named
 from nerfcli.cameras.layout import centres_of
-from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.photos.exif import Position, east_north_up, read_exif
 
@@ -48,11 +47,6 @@ class ScaleEstimate:
     residual_unit: str
     source: str
     details: str = ""
-
-    @property
-    def similarity(self) -> Similarity:
-        """The scaling metres_from_world."""
-        return Similarity(self.metres_per_unit, np.eye(3), np.zeros(3))
 
     @property
     def rms_residual(self) -> float:

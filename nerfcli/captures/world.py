@@ -72,22 +72,18 @@ def up_aligned(frames: Sequence[Frame], axis: str, *, up: np.ndarray | None = No
     return Similarity(1.0, smallest_rotation(np.asarray(up, dtype=np.float64) / length, WORLD_AXES[axis]), np.zeros(3))
 
 
-def moved_to_origin(frames: Sequence[Frame], origin: str, *, depth_hint: float | None = None) -> Similarity:
+def moved_to_origin(frames: Sequence[Frame], origin: str) -> Similarity:
     """Return the translation that moves a place of the old frame to the origin of the new one.
 
     Args:
         origin: centre-of-cameras: the mean of their centres; focus: the point that they look at; or the coordinates
             "x,y,z" of the place in the old frame.
-        depth_hint: the distance to the focus in scene units, for cameras with parallel axes.
-
-    Raises:
-        UserError: an unknown place, or no cameras to compute it from.
     """
     if origin not in ORIGINS:
         return Similarity(1.0, np.eye(3), -point_of(origin, f"choose {', '.join(ORIGINS)}, or x,y,z"))
     if not frames:
         raise UserError(f"the capture has no cameras to compute the {origin} from", "give the origin as x,y,z")
-    place = centres_of(frames).mean(axis=0) if origin == ORIGINS[0] else focus_point(frames, depth_hint=depth_hint)
+    place = centres_of(frames).mean(axis=0) if origin == ORIGINS[0] else focus_point(frames)
     return Similarity(1.0, np.eye(3), -place)
 
 
@@ -179,16 +175,12 @@ def _source(estimate: ScaleEstimate) -> str:
 def _estimate(capture: Capture, wanted: WorldFrame) -> ScaleEstimate | None:
     if wanted.distances:
         return scale_from_distances([known_distance(text, capture.frames) for text in wanted.distances])
-    frames = _with_photos(capture)
+    frames = [frame for frame in capture.frames if frame.has_photo]
     if wanted.markers is not None:
         return _scale_from_markers([upright(frame, measure_of(capture)) for frame in frames], wanted.markers)
     if wanted.scale == GPS:
         return scale_from_gps(frames, gps_positions(frames))
     return None
-
-
-def _with_photos(capture: Capture) -> list[Frame]:
-    return [frame for frame in capture.frames if frame.has_photo]
 
 
 def _scale_from_markers(frames: Sequence[Frame], text: str) -> ScaleEstimate:

@@ -85,8 +85,8 @@ def mesh_of(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None 
     return Mesh(vertices, faces, normals, None if colours is None else colours[used])
 
 
-def without_small_pieces(mesh: Mesh, fraction: float = _SMALLEST_PIECE) -> Mesh:
-    """Return the mesh without connected pieces of fewer than this fraction of all faces."""
+def without_small_pieces(mesh: Mesh) -> Mesh:
+    """Return the mesh without connected pieces of too small a fraction of all faces."""
     if not len(mesh.faces):
         return mesh
     first, second = mesh.faces[:, 0], mesh.faces[:, 1:]
@@ -95,7 +95,7 @@ def without_small_pieces(mesh: Mesh, fraction: float = _SMALLEST_PIECE) -> Mesh:
     )
     _, piece = connected_components(links, directed=False)
     of_faces = piece[first]
-    large = np.bincount(of_faces, minlength=piece.max() + 1) >= fraction * len(first)
+    large = np.bincount(of_faces, minlength=piece.max() + 1) >= _SMALLEST_PIECE * len(first)
     return mesh_of(mesh.vertices, mesh.faces[large[of_faces]], mesh.colours)
 
 

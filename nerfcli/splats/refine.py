@@ -37,7 +37,7 @@ def share_of_pictures(photos: int) -> float:
 
 
 def pictures_beside(
-    model: Model, photos: Sequence[LoadedPhoto], *, seed: int = 0, on_progress: Callable[[float], None]
+    model: Model, photos: Sequence[LoadedPhoto], *, on_progress: Callable[[float], None]
 ) -> list[LoadedPhoto]:
     """Render the field from cameras moved in random directions; none if there are many photos.
 
@@ -46,7 +46,7 @@ def pictures_beside(
     """
     if not share_of_pictures(len(photos)):
         return []
-    rng, frames = np.random.default_rng(seed), [photo.frame for photo in photos]
+    rng, frames = np.random.default_rng(0), [photo.frame for photo in photos]
     spread = float(np.sqrt(np.stack([frame.centre for frame in frames]).var(axis=0).sum()))
     size = np.mean([photo.pixels.shape[0] * photo.pixels.shape[1] for photo in photos]) / REDUCTION**2
     chosen = rng.permutation(len(photos))[: max(1, int(PIXELS / size))]
@@ -151,8 +151,6 @@ def splat_photos(
 
 
 def _levels(log_gains: np.ndarray) -> np.ndarray:
-    import torch
-
     light = linear_from_srgb(torch.arange(256) / 255.0) / torch.from_numpy(np.exp(log_gains))[:, None]
     return srgb_from_linear(light).float().clamp(0.0, 1.0).numpy()
 
@@ -166,7 +164,6 @@ def refine(
     share: float = 0.0,
     seconds: float | None = None,
     steps: int | None = None,
-    seed: int = 0,
     on_step: Callable[[float], None] = lambda fraction: None,
     is_ended: Callable[[], bool] = lambda: False,
     notify: Callable[[str], None] = lambda text: None,
@@ -178,16 +175,12 @@ def refine(
     Args:
         background: sRGB behind photos without alpha; photos with alpha get a random one at each step.
         beside, share: further pictures, and their share of the steps; see `pictures_beside`.
-        seed: of the order of the photos.
         on_step: called with the fraction of the budget that is used.
         is_ended: whether to end before the budget is used, asked before each step.
         notify: called with a line if kernels have to be compiled first, which does not count.
-
-    Raises:
-        UserError: numbers are not finite.
     """
     prepare_splats(notify)
-    rng = np.random.default_rng([seed, state.steps])
+    rng = np.random.default_rng([0, state.steps])
     order: list[int] = []
     began, before = time.perf_counter(), state.seconds
     while (fraction := max(state.seconds / seconds if seconds else 0.0, state.steps / steps if steps else 0.0)) < 1.0:

@@ -125,7 +125,9 @@ def _numbers(model: Model) -> tuple[tuple[int, ...], Tensor, np.ndarray, dict[st
     field = model.field
     if isinstance(field, HashField):
         settings = field.settings
-        _refuse_sizes(settings.features, settings.width)
+        if settings.features != FOUR or settings.width % FOUR:
+            sizes = f"{settings.features} features a row and {settings.width} neurons"
+            raise _too_large(f"it has {sizes}, expected {FOUR} and a multiple of it")
         layers = [layer.detach().cpu().numpy().astype(np.float32) for layer in field.weights]
         # Harmonics above the view degree do not affect colours.
         layers[2] = layers[2].copy()
@@ -151,11 +153,6 @@ def blocks_of(layer: np.ndarray) -> np.ndarray:
     """Split a layer (outputs, inputs) into (blocks, 4, 4), indexed [input, output]; groups of outputs vary slowest."""
     outputs, inputs = (size // FOUR for size in layer.shape)
     return layer.reshape(outputs, FOUR, inputs, FOUR).transpose(0, 2, 3, 1).reshape(-1, FOUR, FOUR)
-
-
-def _refuse_sizes(features: int, width: int) -> None:
-    if features != FOUR or width % FOUR:
-        raise _too_large(f"it has {features} features a row and {width} neurons, expected {FOUR} and a multiple of it")
 
 
 def _too_large(what: str) -> UserError:

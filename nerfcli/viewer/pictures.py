@@ -35,12 +35,10 @@ class PagePhotos:
 
     Args:
         entries: plain values of each frame.
-        longest_px: longer side of the pictures; 0 if there are none.
         missing: number of photos that are not where the run expects them.
     """
 
     entries: list[dict[str, Any]]
-    longest_px: int
     missing: int
 
 
@@ -70,7 +68,7 @@ def page_photos(
             pictures[index] = data_uri(jpeg, "jpeg")
             on_progress((count + 1) / len(of))
     entries = [{**entry, "picture": pictures.get(index)} for index, entry in enumerate(_entries(model, frames))]
-    return PagePhotos(entries, longest, len(frames) - len(there))
+    return PagePhotos(entries, len(frames) - len(there))
 
 
 def fetched_photos(model: Model, train: Sequence[Frame], test: Sequence[Frame]) -> list[dict[str, Any]]:

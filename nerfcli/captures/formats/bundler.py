@@ -36,7 +36,7 @@ _FOCAL_GUESS = re.compile(r"[\d.eE+-]+", re.ASCII)
 Numbered = tuple[int, str]
 
 
-def parse_bundler(path: Path, given: UserInputs = UserInputs(), *, image_list: Path | None = None) -> Capture:
+def parse_bundler(path: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the registered cameras, the points with their colours, and where the points were seen.
 
     Cameras of focal length 0 are those that Bundler could not register; they give no frames. The file gives neither
@@ -46,7 +46,7 @@ def parse_bundler(path: Path, given: UserInputs = UserInputs(), *, image_list: P
     """
     lines = _lines(path)
     num_cameras, num_points = _counts(lines, path)
-    image_list = image_list or _find_list(path)
+    image_list = _find_list(path)
     listed = enumerate(read_text(image_list, _LIST_EXPECTED).splitlines(), start=1)
     names = [_listed(line, f"{image_list}: line {number}") for number, line in listed if line.strip()]
     if len(names) != num_cameras:
