@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from ellipsoids import Ellipsoid, bean, line_integrals
 
-from nerfcli.ct.circle import Circle
-from nerfcli.ct.geometry import Beam
+from nerfcli.ct.geometry import Beam, Circle
 from nerfcli.ct.scan import Scan, held_out_views
 
 

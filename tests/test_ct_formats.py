@@ -8,11 +8,10 @@ import pytest
 from commands import error_of, nerfcli
 from scan_files import WRITERS, Written, nikon, stack
 
-from nerfcli.ct.circle import Circle, circle_of
 from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.formats.read import read_scan
 from nerfcli.ct.formats.statement import ScanOptions
-from nerfcli.ct.geometry import ScanGeometry
+from nerfcli.ct.geometry import Circle, ScanGeometry, circle_of
 from nerfcli.ct.grid import load_truth
 from nerfcli.ct.recognise import recognise
 from nerfcli.ct.scan import load_scan

@@ -9,7 +9,7 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerfcli.ct.geometry import circular_cone, circular_parallel
+from nerfcli.ct.geometry import Circle
 from nerfcli.ct.grid import VoxelGrid, centred_grid, grid_of_scan
 from nerfcli.kernels import numba_cpu, reference
 
@@ -56,12 +56,9 @@ def test_error_of_a_smooth_ball_falls_with_the_square_of_the_voxel(beam: str) ->
     """Closed form: a Gaussian ball's integral is a Gaussian of the line's distance from its centre."""
     angles = np.linspace(0.1, 3.0, 5)
     if beam == "parallel":
-        geometry = circular_parallel(angles, pixel_width=0.4, pixel_height=0.4, rows=8, columns=12)
+        geometry = Circle("parallel", tuple(angles), 0.4, 0.4, 8, 12).geometry()
     else:
-        geometry = circular_cone(
-            angles, source_origin=20, source_detector=30, pixel_width=0.6, pixel_height=0.6,
-            rows=1 if beam == "fan" else 8, columns=12,
-        )  # fmt: skip
+        geometry = Circle("cone", tuple(angles), 0.6, 0.6, 1 if beam == "fan" else 8, 12, 20, 30).geometry()
     origins, directions = (torch.from_numpy(x.reshape(-1, 3)) for x in geometry.rays())
     width, centre = 1.5, torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
     apart = torch.linalg.cross(origins - centre, directions).norm(dim=1)
@@ -190,15 +187,7 @@ def test_compiled_denoising_agrees(generator: torch.Generator) -> None:
 
 
 def test_grids_of_a_scan_cover_what_it_sees() -> None:
-    geometry = circular_cone(
-        np.linspace(0, 6, 7),
-        source_origin=40,
-        source_detector=60,
-        pixel_width=0.3,
-        pixel_height=0.3,
-        rows=20,
-        columns=30,
-    )
+    geometry = Circle("cone", tuple(np.linspace(0, 6, 7)), 0.3, 0.3, 20, 30, 40, 60).geometry()
     grid = grid_of_scan(geometry)
     assert isinstance(grid, VoxelGrid)
     assert grid.size == pytest.approx(0.2)

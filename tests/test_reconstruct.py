@@ -15,7 +15,7 @@ from nerfcli.ct.baselines import filtered_back_projection, filtered_misfit, sart
 from nerfcli.ct.calibrate import air_factors, detector_tilt, found_noise
 from nerfcli.ct.centre import centre_of
 from nerfcli.ct.evaluate import resampled, score_volume
-from nerfcli.ct.geometry import ScanGeometry, circular_cone, circular_parallel
+from nerfcli.ct.geometry import Circle, ScanGeometry
 from nerfcli.ct.grid import (
     OUTSIDE,
     TRUNCATED,
@@ -41,7 +41,9 @@ def cone(
     views: int = 30, *, rows: int = 24, columns: int = 40, pixel: float = 0.9, turn: float = 2 * np.pi
 ) -> ScanGeometry:
     sizes = {"pixel_width": pixel, "pixel_height": pixel, "rows": rows, "columns": columns}
-    return circular_cone(np.arange(views) * turn / views, source_origin=60, source_detector=90, **sizes)
+    return Circle(
+        "cone", tuple(np.arange(views) * turn / views), source_origin=60, source_detector=90, **sizes
+    ).geometry()
 
 
 def scan_of(geometry: ScanGeometry, *, photons: float = PHOTONS, seed: int = 0, held_out: tuple[int, ...] = ()) -> Scan:
@@ -105,7 +107,7 @@ def test_many_views_over_a_limited_angle_do_not_diverge(monkeypatch: pytest.Monk
     fewer subsets, and halving them when the objective rises, each prevent it. The detector is a little too small.
     """
     angles, sizes = np.arange(300) * np.pi / 600, {"pixel_width": 0.8, "pixel_height": 0.8, "rows": 1, "columns": 100}
-    geometry = circular_cone(angles, source_origin=410, source_detector=553, **sizes)
+    geometry = Circle("cone", tuple(angles), source_origin=410, source_detector=553, **sizes).geometry()
     integrals = line_integrals(bean(4.0), *geometry.rays())
     noisy = integrals + 0.01 * np.random.default_rng(0).normal(size=integrals.shape)
     grid = grid_of_scan(geometry, 0.8)
@@ -137,11 +139,9 @@ def test_filtered_back_projection_has_the_right_scale(beam: str) -> None:
 
     angles = np.arange(180) * (np.pi if beam == "half" else 2 * np.pi) / 180
     if beam == "cone":
-        geometry = circular_cone(
-            angles, source_origin=60, source_detector=90, pixel_width=0.5, pixel_height=0.5, rows=40, columns=64
-        )
+        geometry = Circle("cone", tuple(angles), 0.5, 0.5, 40, 64, 60, 90).geometry()
     else:
-        geometry = circular_parallel(angles, pixel_width=0.35, pixel_height=0.35, rows=40, columns=64)
+        geometry = Circle("parallel", tuple(angles), 0.35, 0.35, 40, 64).geometry()
     integrals = line_integrals([sphere((1.0, -1.0, 0.0), 4.0, 0.2)], *geometry.rays())
     grid = centred_grid((12.0, 12.0, 3.0), 0.5)
     volume = filtered_back_projection(geometry, integrals, grid)
@@ -206,7 +206,7 @@ def test_chi_square_of_the_truth_is_one(scan: Scan) -> None:
 @pytest.mark.parametrize(("rows", "columns", "factor"), [(24, 40, 2), (2, 64, 6), (1, 40, 3), (7, 41, 5)])
 def test_larger_pixels_see_what_their_parts_see(rows: int, columns: int, factor: int) -> None:
     """The centre of a larger pixel is the mean of the centres of its parts, and likelihoods have as many pixels."""
-    geometry = circular_parallel([0.3, 1.1], pixel_width=0.5, pixel_height=0.4, rows=rows, columns=columns)
+    geometry = Circle("parallel", (0.3, 1.1), 0.5, 0.4, rows, columns).geometry()
     coarse = geometry.binned(factor)
     scan = Scan(geometry, "transmission", np.full((2, rows, columns), 0.5, np.float32), photons_per_value=100.0)
     likelihood = likelihood_of(scan, np.arange(2), binning=factor)
@@ -330,7 +330,7 @@ def test_centre_of_rotation_is_found(shift: float) -> None:
 
 
 def test_centre_of_a_parallel_half_turn_is_found() -> None:
-    geometry = circular_parallel(np.arange(90) * np.pi / 90, pixel_width=0.5, pixel_height=0.5, rows=1, columns=48)
+    geometry = Circle("parallel", tuple(np.arange(90) * np.pi / 90), 0.5, 0.5, 1, 48).geometry()
     scan = scan_of(geometry)
     misaligned = Scan(geometry.shifted(-2.0), "counts", scan.values, scan.open_beam, photons_per_value=20.0)
     assert centre_of(highest_contrast_row(misaligned)).shift == pytest.approx(2.0, abs=0.15)
@@ -360,7 +360,7 @@ def test_brightness_of_each_view_is_measured_beside_the_object() -> None:
 def test_marks_of_truncation_wedge_and_blind_voxels() -> None:
     """Closed form: a parallel beam whose detector is half as wide as the grid sees a disc in all views."""
     angles = np.arange(40) * np.pi / 40
-    geometry = circular_parallel(angles, pixel_width=1.0, pixel_height=1.0, rows=6, columns=20)
+    geometry = Circle("parallel", tuple(angles), 1.0, 1.0, 6, 20).geometry()
     grid = centred_grid((40.0, 40.0, 10.0), 1.0)
     found = marks(geometry, grid)
     y, x = np.meshgrid(grid.axis("y"), grid.axis("x"), indexing="ij")
@@ -370,7 +370,7 @@ def test_marks_of_truncation_wedge_and_blind_voxels() -> None:
     assert (middle[(radius > 11.5) & (radius < 19)] == OUTSIDE).all()
     assert (found[0] == UNSEEN).all()  # above the detector
     assert missing_wedge_deg(geometry) == 0
-    limited = circular_parallel(angles[:20], pixel_width=1.0, pixel_height=1.0, rows=6, columns=60)
+    limited = Circle("parallel", tuple(angles[:20]), 1.0, 1.0, 6, 60).geometry()
     assert missing_wedge_deg(limited) == pytest.approx(94.5)
     assert (marks(limited, grid)[5] == WEDGE).all()
 
@@ -379,14 +379,14 @@ def test_marks_of_cone_ends_and_of_a_detector_beside_the_middle() -> None:
     """Closed form: the cone's rays leave the top at a height of h (D - r) / D; a full turn sees both halves."""
     angles = np.arange(120) * 2 * np.pi / 120
     sides = {"pixel_width": 1.0, "pixel_height": 1.0, "rows": 20, "columns": 60}
-    geometry = circular_cone(angles, source_origin=100, source_detector=100, **sides)
+    geometry = Circle("cone", tuple(angles), source_origin=100, source_detector=100, **sides).geometry()
     grid = centred_grid((20.0, 20.0, 20.0), 1.0)
     found = marks(geometry, grid)
     z, y, x = np.meshgrid(*(grid.axis(name) for name in "zyx"), indexing="ij")
     least = 10.5 * (1 - np.hypot(x, y) / 100)  # half a pixel beyond the last row
     assert (found[np.abs(z) < least - 0.1] == 0).all()
     assert (found[np.abs(z) > least + 0.1] == TRUNCATED).all()
-    half = circular_parallel(angles, **sides).shifted(25)
+    half = Circle("parallel", tuple(angles), **sides).geometry().shifted(25)
     wide = centred_grid((80.0, 80.0, 4.0), 2.0)
     y, x = np.meshgrid(wide.axis("y"), wide.axis("x"), indexing="ij")
     assert (marks(half, wide)[0][np.hypot(x, y) < 45] == 0).all()  # each line is seen from one of its ends

@@ -104,9 +104,7 @@ def filtered_misfit(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGr
     return float((left * _ramp(left.astype(np.float64), 1.0)).sum())
 
 
-def sart_total_variation(
-    geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGrid, *, rounds: int = SART_ROUNDS
-) -> Tensor:
+def sart_total_variation(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGrid) -> Tensor:
     """Reconstruct by SART with positivity and total variation denoising after each round over the views.
 
     Args:
@@ -124,7 +122,7 @@ def sart_total_variation(
     volume, dual = torch.zeros(grid.shape), torch.zeros(3, *grid.shape)
     measured = torch.from_numpy(np.ascontiguousarray(integrals, dtype=np.float32).reshape(geometry.views, -1))
     order = sorted(range(geometry.views), key=lambda view: int(format(view, "016b")[::-1], 2))
-    for number in range(rounds):
+    for number in range(SART_ROUNDS):
         for view in order:
             index = np.array([view])
             chord = projector.forward(ones, index)

@@ -6,9 +6,8 @@ import numpy as np
 from skimage.filters import threshold_otsu
 
 from nerfcli.ct.centre import FEWEST_VIEWS, FINE, centre_of
-from nerfcli.ct.circle import circle_of
 from nerfcli.ct.formats.assemble import axis_column
-from nerfcli.ct.geometry import ScanGeometry
+from nerfcli.ct.geometry import ScanGeometry, circle_of
 from nerfcli.ct.quick import filled, highest_contrast_row, predicted, reconstructed
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import several

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.ct.circle import circle_of
 from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.formats.read import read_scan
+from nerfcli.ct.geometry import circle_of
 from nerfcli.ct.recognise import is_reconstruction, is_volume
 from nerfcli.ct.result import load_reconstruction
 from nerfcli.ct.scan import MEASUREMENT, Scan

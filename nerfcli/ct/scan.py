@@ -194,9 +194,9 @@ def load_scan(folder: Path) -> Scan:
         raise UserError(f"{path} cannot be read as a scan: {error}", "convert the scan again") from error
 
 
-def held_out_views(views: int, every: int = HELD_OUT_EVERY) -> tuple[int, ...]:
-    """Return the views held out by default: every `every`-th from the first; none if there are too few views."""
-    return tuple(range(0, views, every)) if views > every else ()
+def held_out_views(views: int) -> tuple[int, ...]:
+    """Return the views held out by default: every few from the first; none if there are too few views."""
+    return tuple(range(0, views, HELD_OUT_EVERY)) if views > HELD_OUT_EVERY else ()
 
 
 def read_array(path: Path, digest: str) -> np.ndarray:

@@ -11,6 +11,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.distortion import Distortion
@@ -100,7 +101,6 @@ MOST_OFF_PX = 0.1
 _GOOD_PX = 0.01
 # Skew counts as rounding if it shifts the bottom of the picture by at most this much against its top.
 _NEGLIGIBLE_SKEW_PX = 0.02
-_STEPS = 40
 
 
 class Terms(NamedTuple):
@@ -219,23 +219,21 @@ def _best(plain: Camera, start: Camera, terms: Terms) -> tuple[Camera, float]:
 
 
 def _fitted(camera: Camera, last: int, directions: np.ndarray, truth: np.ndarray) -> Camera:
-    """Return the camera with its parameters from the fifth to the `last` by least squares (Levenberg-Marquardt)."""
-    error, damping = _squares(camera, directions, truth), 1e-6
-    for _ in range(_STEPS):
-        pixels, _ = camera.project(directions)
-        _, by_parameters, seen = camera.project_jacobian(directions)
-        columns = by_parameters[seen][:, :, 4:last].reshape(2 * seen.sum(), -1)
-        lengths = np.linalg.norm(columns, axis=0)
-        lengths[lengths == 0] = 1.0
-        normal, goal = (columns / lengths).T, (truth - pixels)[seen].ravel()
-        step = np.linalg.solve(normal @ normal.T + damping * np.eye(len(normal)), normal @ goal) / lengths
-        values = (*camera.params[:4], *(np.array(camera.params[4:last]) + step).tolist(), *camera.params[last:])
-        moved = Camera(camera.model, *camera.size, values)
-        squares = _squares(moved, directions, truth)
-        damping *= 10.0 if squares > error else 0.1
-        if squares <= error:
-            camera, error = moved, squares
-    return camera
+    """Return the camera with its parameters from the fifth to the `last` by least squares."""
+
+    def moved(values: np.ndarray) -> Camera:
+        return Camera(camera.model, *camera.size, (*camera.params[:4], *values.tolist(), *camera.params[last:]))
+
+    def misses(values: np.ndarray) -> np.ndarray:
+        pixels, seen = moved(values).project(directions)
+        return np.where(seen[:, None], pixels - truth, 1e3).ravel()  # a direction without a pixel counts as far off
+
+    def by_terms(values: np.ndarray) -> np.ndarray:
+        _, by_parameters, _ = moved(values).project_jacobian(directions)
+        return by_parameters[:, :, 4:last].reshape(truth.size, -1)
+
+    start = np.array(camera.params[4:last])
+    return moved(least_squares(misses, start, by_terms, method="lm", x_scale="jac", xtol=1e-12, ftol=1e-12).x)
 
 
 def _true_pixels(plain: Camera, terms: Terms) -> tuple[np.ndarray, np.ndarray]:
@@ -255,12 +253,6 @@ def _true_pixels(plain: Camera, terms: Terms) -> tuple[np.ndarray, np.ndarray]:
     pixels = moved * focal + centre
     pixels[0] += terms.skew * moved[1]
     return directions[:, valid].T, pixels.T
-
-
-def _squares(camera: Camera, directions: np.ndarray, truth: np.ndarray) -> float:
-    """Return the sum of the squared distances of pixels from the true ones; infinite if one has no pixel."""
-    pixels, seen = camera.project(directions)
-    return float(((pixels - truth) ** 2).sum()) if seen.all() else np.inf
 
 
 def _off_px(camera: Camera, directions: np.ndarray, truth: np.ndarray) -> float:

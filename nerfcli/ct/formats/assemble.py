@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from nerfcli.captures.holdout import names_held_out
-from nerfcli.ct.circle import Circle
 from nerfcli.ct.formats.statement import MILLIMETRES, ScanOptions, check_pixel_size
-from nerfcli.ct.geometry import ScanGeometry
+from nerfcli.ct.geometry import Circle, ScanGeometry
 from nerfcli.ct.open_beam import OpenBeam
 from nerfcli.ct.scan import Kind, Scan, held_out_views
 from nerfcli.errors import UserError, several

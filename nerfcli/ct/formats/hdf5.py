@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.ct.circle import Circle
 from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
 from nerfcli.ct.formats.statement import ScanOptions, angles_in_radians, millimetres
+from nerfcli.ct.geometry import Circle
 from nerfcli.ct.open_beam import check_sizes, open_beam_of
 from nerfcli.ct.recognise import datasets_in, open_hdf5
 from nerfcli.ct.scan import Scan

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.ct.circle import Circle
 from nerfcli.ct.formats.assemble import ReaderOutput, scan_of
-from nerfcli.ct.formats.statement import ScanOptions, angles_in_radians, millimetres
+from nerfcli.ct.formats.statement import ScanOptions, Statement, angles_in_radians, millimetres
+from nerfcli.ct.geometry import Circle
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
 
@@ -25,49 +25,30 @@ def read_heltomo(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
         UserError: it cannot be read or is another .mat file.
     """
     name, data = _struct(path)
-    parameters = data.parameters
+    fields = Statement(path, vars(data.parameters), hint=_HINT)
     sinogram = np.asarray(data.sinogram, dtype=np.float32)
     if sinogram.ndim != 2:
         raise UserError(f"{path}: the sinogram in {name} has shape {sinogram.shape}", "expected views x columns")
-    unit = millimetres(str(getattr(parameters, "distanceUnit", "mm")), where=f"{path}: distanceUnit")
-    angles = angles_in_radians(
-        np.atleast_1d(_field(parameters, "angles", path)),
-        views=len(sinogram),
-        unit="degrees",
-        where=f"{path}: angles",
-    )
+    unit = millimetres(fields.text("distanceUnit", "mm"), where=f"{path}: distanceUnit")
+    if "angles" not in fields:
+        raise UserError(f"{path} has no angles", _HINT)
+    stated_angles = np.atleast_1d(fields.value("angles"))
+    angles = angles_in_radians(stated_angles, views=len(sinogram), unit="degrees", where=f"{path}: angles")
     columns = sinogram.shape[1]
-    stated = int(getattr(parameters, "numDetectorsPost", columns))
+    stated = int(fields.value("numDetectorsPost", columns))
     if stated != columns:
         raise UserError(
             f"{path}: {columns} columns, but numDetectorsPost is {stated}",
             "the sinogram was cropped: correct one of them",
         )
-    pixel = unit * _number(parameters, "pixelSizePost", path)
-    circle = Circle(
-        "cone",
-        tuple((angles - np.pi / 2).tolist()),
-        pixel,
-        pixel,
-        1,
-        columns,
-        unit * _number(parameters, "distanceSourceOrigin", path),
-        unit * _number(parameters, "distanceSourceDetector", path),
+    pixel = unit * fields.positive("pixelSizePost")
+    origin, detector = (unit * fields.positive(f"distanceSource{to}") for to in ("Origin", "Detector"))
+    circle = Circle("cone", tuple((angles - np.pi / 2).tolist()), pixel, pixel, 1, columns, origin, detector)
+    history = {"project": fields.text("projectName", path.stem)}
+    found = ReaderOutput(
+        *(path, "heltomo", sinogram[:, None], "line_integral", circle, "mm"), history=history, stated_mm=unit
     )
-    project = str(getattr(parameters, "projectName", path.stem))
-    return scan_of(
-        ReaderOutput(
-            path,
-            "heltomo",
-            sinogram[:, None],
-            "line_integral",
-            circle,
-            "mm",
-            history={"project": project},
-            stated_mm=unit,
-        ),
-        given,
-    )
+    return scan_of(found, given)
 
 
 def _struct(path: Path) -> tuple[str, Any]:
@@ -84,20 +65,3 @@ def _struct(path: Path) -> tuple[str, Any]:
             return name, value
     names = ", ".join(name for name in content if not name.startswith("__")) or "nothing"
     raise UserError(f"{path} holds {names}, and no sinogram with its parameters", _HINT)
-
-
-def _field(parameters: Any, name: str, path: Path) -> Any:
-    if not hasattr(parameters, name):
-        raise UserError(f"{path}: parameters have no {name}", _HINT)
-    return getattr(parameters, name)
-
-
-def _number(parameters: Any, name: str, path: Path) -> float:
-    value = _field(parameters, name, path)
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = float("nan")
-    if not (np.isfinite(number) and number > 0):
-        raise UserError(f"{path}: {name} is {value!r}", "expected a length above 0")
-    return number

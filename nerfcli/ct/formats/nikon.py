@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfcli.ct.circle import Circle
 from nerfcli.ct.formats.assemble import ReaderOutput, scan_of
 from nerfcli.ct.formats.pictures import numbered, read_stack
 from nerfcli.ct.formats.statement import ScanOptions, Statement, angles_in_radians, read_lines
+from nerfcli.ct.geometry import Circle
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
 

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
@@ -63,6 +64,16 @@ def read_stack(paths: Sequence[Path]) -> np.ndarray:
                 )
             frames.append(frame)
     return np.stack(frames)
+
+
+def read_npy(path: Path, *, hint: str) -> np.ndarray:
+    """Read the array of a .npy file; `hint` says what to do where it is missing or damaged."""
+    try:
+        return np.load(path, allow_pickle=False)
+    except FileNotFoundError as error:
+        raise UserError(f"{path} does not exist", hint) from error
+    except (OSError, ValueError, EOFError, SyntaxError, TokenError) as error:
+        raise UserError(f"{path} cannot be read: {error}", hint) from error
 
 
 def _pages(path: Path) -> np.ndarray:

@@ -5,14 +5,14 @@ Lengths have no unit: the volume is about 2 wide.
 """
 
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 
-from nerfcli.ct.circle import Circle
 from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
+from nerfcli.ct.formats.pictures import read_npy
 from nerfcli.ct.formats.statement import ScanOptions, Statement, angles_in_radians, read_object
+from nerfcli.ct.geometry import Circle
 from nerfcli.ct.grid import described_truth
 from nerfcli.ct.recognise import R2_GAUSSIAN
 from nerfcli.ct.scan import Scan
@@ -85,12 +85,7 @@ def _projection(file: Path, frame: dict[str, Any]) -> np.ndarray:
     if not isinstance(name, str):
         raise UserError(f"{file}: a projection has no file_path", _HINT)
     place = file.parent / name.replace("\\", "/")
-    try:
-        array = np.load(place, allow_pickle=False)
-    except FileNotFoundError as error:
-        raise UserError(f"{place} does not exist", f"{R2_GAUSSIAN} lists it: restore the projection") from error
-    except (OSError, ValueError, EOFError, SyntaxError, TokenError) as error:
-        raise UserError(f"{place} cannot be read: {error}", "it is damaged: export it again") from error
+    array = read_npy(place, hint=f"{R2_GAUSSIAN} lists it: restore the projection, or export it again")
     if array.ndim != 2:
         raise UserError(f"{place} has shape {array.shape}", "a projection is rows x columns")
     return array.astype(np.float32)

@@ -31,11 +31,10 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.ct.circle import Circle
 from nerfcli.ct.formats.assemble import ReaderOutput, scan_of
-from nerfcli.ct.formats.pictures import SUFFIXES, numbered, read_stack
+from nerfcli.ct.formats.pictures import SUFFIXES, numbered, read_npy, read_stack
 from nerfcli.ct.formats.statement import ScanOptions, Statement, angles_in_radians, millimetres, read_object
-from nerfcli.ct.geometry import Beam, ScanGeometry, from_vectors
+from nerfcli.ct.geometry import Beam, Circle, ScanGeometry, from_vectors
 from nerfcli.ct.grid import described_truth
 from nerfcli.ct.open_beam import OpenBeam, check_sizes, open_beam_of
 from nerfcli.ct.recognise import STACK
@@ -148,10 +147,7 @@ def _open_beam(file: Path, fields: Statement, shape: tuple[int, ...]) -> OpenBea
 def _pictures(file: Path, pattern: str, what: str) -> np.ndarray:
     place = file.parent / pattern
     if place.suffix == ".npy":
-        try:
-            array = np.load(place, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise UserError(f"{place} cannot be read: {error}", f"{file.name} names it for the {what}") from error
+        array = read_npy(place, hint=f"{file.name} names it for the {what}")
         array = array[None] if array.ndim == 2 else array
         if array.ndim != 3 or not np.issubdtype(array.dtype, np.number):
             raise UserError(f"{place} has shape {array.shape}", "expected views x rows x columns of numbers")

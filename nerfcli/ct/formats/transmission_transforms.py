@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.ct.circle import circle_of
 from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
-from nerfcli.ct.formats.pictures import read_stack
+from nerfcli.ct.formats.pictures import read_npy, read_stack
 from nerfcli.ct.formats.statement import ScanOptions, Statement, read_object
-from nerfcli.ct.geometry import ScanGeometry
+from nerfcli.ct.geometry import ScanGeometry, circle_of
 from nerfcli.ct.grid import described_truth
 from nerfcli.ct.recognise import TRANSFORMS, TRANSFORMS_GEOMETRY
 from nerfcli.ct.scan import Scan
@@ -104,10 +103,7 @@ def _frames(folder: Path) -> tuple[list[dict[str, Any]], Statement]:
 def _values(path: Path, folder: Path, frames: list[dict[str, Any]]) -> tuple[np.ndarray, str, float | None]:
     """Return the values, their kind, and the photons that the name of a .npy states."""
     if path.suffix == ".npy":
-        try:
-            values = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise UserError(f"{path} cannot be read: {error}", "it is damaged: export it again") from error
+        values = read_npy(path, hint="it is damaged: export it again")
         photons = re.search(r"I0_(\d+)", path.stem)
         kind = "line_integral" if "line_integral" in path.stem else "transmission"
         return values, kind, float(photons[1]) if photons and kind == "transmission" else None
