@@ -4,10 +4,11 @@ import math
 import platform
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -97,9 +98,7 @@ def train_scan(
             reporter.warn("photons per detector value not given: estimated from the noise of neighbouring pixels")
         threads = thread_count(settings.threads)
         use_threads(threads)
-        result, interrupt = _fit(
-            loaded, folder, settings, earlier=earlier if resume else None, progress=reporter.progress
-        )
+        result, interrupt = _fit(loaded, folder, settings, earlier if resume else None, reporter.progress)
         (run / METRICS).unlink(missing_ok=True)  # they belong to the volume that is replaced
         save_reconstruction(run, result)
     if interrupt is not None:
@@ -123,103 +122,90 @@ def _wanted(settings: ReconstructionSettings) -> ReconstructionSettings:
 
 
 def _fit(
-    scan: Scan,
-    folder: Path,
-    settings: ReconstructionSettings,
-    *,
-    earlier: Reconstruction | None,
-    progress: Progress,
+    scan: Scan, folder: Path, settings: ReconstructionSettings, earlier: Reconstruction | None, progress: Progress
 ) -> tuple[Reconstruction, KeyboardInterrupt | None]:
     """Fit the volume, and return what interrupted the fit, if anything; before the fit, an interrupt is passed on."""
     begun = time.perf_counter() - (0.0 if earlier is None else earlier.seconds)
-    deadline = math.inf if settings.budget_seconds is None else begun + CHOICE_FRACTION * settings.budget_seconds
-
-    def left() -> float | None:
-        return None if deadline == math.inf else max(deadline - time.perf_counter(), 0.0)
-
-    decisions: list[str] = []
-    views, digest = scan.training_views, scan.digest
+    digest, decisions = scan.digest, list[str]()
     # Check memory first: correcting the geometry takes seconds, and hardly changes the number of voxels.
     _fits_memory(grid_of_scan(scan.geometry, settings.voxel_size) if earlier is None else earlier.grid)
-    centre, tilt = _geometry(scan, settings, earlier, decisions, progress, left)
-    geometry = scan.geometry.corrected(centre, tilt)
+    used = earlier.used if earlier is not None else _estimates(scan, settings, decisions, progress)
+    geometry = scan.geometry.corrected(float(used["centre"]), float(used["tilt"]))
     grid = earlier.grid if earlier is not None else grid_of_scan(geometry, settings.voxel_size)
-    if earlier is not None:
-        strength, error = float(earlier.used["strength"]), float(earlier.used["model_error"])
-        lower = float(earlier.used.get("noise_lower", 1.0))
-    else:
-        progress(0.0, "noise and model error")
-        strength = settings.strength
-        lower, error = found_noise(with_noise(scan), geometry, grid, seconds=left())
-        if lower > 1:
-            decisions.append(f"noise: lowered by a factor of {lower:.2g}, as views that were left out show")
-        if error > 0:
-            decisions.append(f"model error: line integrals are uncertain by {error:.2g} beyond photon noise")
-    likelihood = likelihood_of(scan, views)
-    factors = None
-    if earlier is not None:
-        factors = earlier.used.get("air")
-    elif settings.air is not False and isinstance(likelihood, Poisson):
-        factors = _air(
-            *(scan, geometry, grid, likelihood, strength),
-            forced=settings.air is True,
-            seconds=left(),
-            decisions=decisions,
-        )
-    if lower > 1:  # after the open beam, whose estimate has errors that are not those of counting
+    lower = float(used.get("noise_lower", 1.0))
+    if lower > 1:
         scan = with_noise(scan, lower=lower)
-        likelihood = likelihood_of(scan, views)
-    if factors is not None and isinstance(likelihood, Poisson):
-        likelihood = likelihood.scaled(torch.tensor(factors))
-    if isinstance(likelihood, Poisson):
-        likelihood = likelihood.with_model_error(error)
-    problem = Problem(geometry.select(views), likelihood, grid)
-
-    used = {
-        "strength": strength,
-        "noise_lower": lower,
-        "model_error": error,
-        "centre": centre,
-        "tilt": tilt,
-        "air": factors,
-    }
+    problem = _problem(scan, geometry, grid, used)
     if earlier is not None:
         fit = Fit(torch.from_numpy(np.array(earlier.volume)), torch.zeros(3, *grid.shape), earlier.passes)
     else:
-        fit = _coarse_start(
-            scan, geometry, grid, factors, (strength, error), seconds_left(settings.budget_seconds, begun)
-        )
+        # The start is interpolated from a fit with voxels and pixels twice as large.
+        coarse = _problem(scan, geometry, grid.coarser(2), used, binning=2)
+        limit = seconds_left(settings.budget_seconds, begun)
+        limit = None if limit is None else COARSE_FRACTION * limit
+        strength = used["strength"]
+        fit = reconstruct(coarse, start(coarse), strength=strength, passes=COARSE_PASSES, seconds=limit)
+        fit = finer(fit, grid)
         if lower > 1:
-            fit = _better_start(fit, problem, logarithms(scan, factors))
-    fit, interrupt = _fit_voxels(
-        *(problem, fit, strength),
-        passes=MOST_PASSES if settings.passes is None else max(settings.passes - fit.passes, 1),
-        seconds=seconds_left(settings.budget_seconds, begun),
-        progress=progress,
-    )
+            fit = _better_start(fit, problem, logarithms(scan, used["air"]))
+    kept, interrupt = deque([fit], maxlen=1), None
+    try:
+        fit = reconstruct(
+            *(problem, fit),
+            strength=float(used["strength"]),
+            passes=MOST_PASSES if settings.passes is None else max(settings.passes - fit.passes, 1),
+            seconds=seconds_left(settings.budget_seconds, begun),
+            progress=progress,
+            keep=kept.append,
+        )
+    except KeyboardInterrupt as caught:
+        fit, interrupt = kept[-1], caught
     found = marks(problem.geometry, grid)
     decisions += [f"{words}; they are marked" for words in marks_in_words(found, (UNSEEN, TRUNCATED))]
     wedge = missing_wedge_deg(problem.geometry)
     if wedge > 0:
         decisions.append(f"missing wedge of {wedge:.0f} degrees: edges along its directions are not determined")
     result = Reconstruction(
-        fit.volume.numpy(),
-        found,
-        grid,
-        scan.unit,
-        folder,
-        digest,
-        settings,
-        used,
-        tuple(decisions),
-        fit.passes,
-        time.perf_counter() - begun,
-        fit.settled,
-        wedge,
+        *(fit.volume.numpy(), found, grid, scan.unit, folder, digest, settings, used, tuple(decisions)),
+        *(fit.passes, time.perf_counter() - begun, fit.settled, wedge),
         {"nerfcli": __version__, "python": platform.python_version(), "torch": version("torch")},
         complete=interrupt is None,
     )
     return result, interrupt
+
+
+def _estimates(
+    scan: Scan, settings: ReconstructionSettings, decisions: list[str], progress: Progress
+) -> dict[str, Any]:
+    """Return what is estimated from the scan, or set, before the fit: the `used` of a reconstruction."""
+    budget = settings.budget_seconds
+    deadline = math.inf if budget is None else time.perf_counter() + CHOICE_FRACTION * budget
+
+    def left() -> float | None:
+        return None if deadline == math.inf else max(deadline - time.perf_counter(), 0.0)
+
+    centre, tilt = _geometry(scan, settings, decisions, progress, left)
+    geometry = scan.geometry.corrected(centre, tilt)
+    grid = grid_of_scan(geometry, settings.voxel_size)
+    progress(0.0, "noise and model error")
+    lower, error = found_noise(with_noise(scan), geometry, grid, seconds=left())
+    if lower > 1:
+        decisions.append(f"noise: lowered by a factor of {lower:.2g}, as views that were left out show")
+    if error > 0:
+        decisions.append(f"model error: line integrals are uncertain by {error:.2g} beyond photon noise")
+    used = {"strength": settings.strength, "noise_lower": lower, "model_error": error, "centre": centre, "tilt": tilt}
+    # The open beam is estimated with the noise as stated, as its errors are not those of counting.
+    return used | {"air": None if settings.air is False else _air(scan, geometry, grid, settings, decisions, left())}
+
+
+def _problem(scan: Scan, geometry: ScanGeometry, grid: VoxelGrid, used: Mapping[str, Any], binning: int = 1) -> Problem:
+    """Return the fit of the training views, binned, with the estimated model error and open beam."""
+    likelihood = likelihood_of(scan, scan.training_views, binning=binning)
+    if isinstance(likelihood, Poisson):
+        likelihood = likelihood.with_model_error(float(used.get("model_error", 0.0)))
+        if used.get("air") is not None:
+            likelihood = likelihood.scaled(torch.tensor(used["air"]))
+    return Problem(geometry.binned(binning).select(scan.training_views), likelihood, grid)
 
 
 def seconds_left(total: float | None, begun: float) -> float | None:
@@ -227,35 +213,13 @@ def seconds_left(total: float | None, begun: float) -> float | None:
     return None if total is None else max(total - (time.perf_counter() - begun), LEAST_FRACTION * total)
 
 
-def _fit_voxels(
-    problem: Problem, fit: Fit, strength: float, *, passes: int, seconds: float | None, progress: Progress
-) -> tuple[Fit, KeyboardInterrupt | None]:
-    kept = deque([fit], maxlen=1)
-    try:
-        fitted = reconstruct(
-            problem,
-            fit,
-            strength=strength,
-            passes=passes,
-            seconds=seconds,
-            progress=progress,
-            keep=kept.append,
-        )
-        return fitted, None
-    except KeyboardInterrupt as interrupt:
-        return kept[-1], interrupt
-
-
 def _geometry(
     scan: Scan,
     settings: ReconstructionSettings,
-    earlier: Reconstruction | None,
     decisions: list[str],
     progress: Progress,
     left: Callable[[], float | None],
 ) -> tuple[float, float]:
-    if earlier is not None:
-        return float(earlier.used["centre"]), float(earlier.used["tilt"])
     centre, tilt = settings.centre, settings.tilt
     if centre is None and len(scan.training_views) < FEWEST_VIEWS:
         centre = 0.0
@@ -285,54 +249,30 @@ def _air(
     scan: Scan,
     geometry: ScanGeometry,
     grid: VoxelGrid,
-    likelihood: Poisson,
-    strength: float,
-    *,
-    forced: bool,
-    seconds: float | None,
+    settings: ReconstructionSettings,
     decisions: list[str],
+    seconds: float | None,
 ) -> list[float] | None:
     """Estimate factors on the open beam of each training view; None if, unless forced, they vary no more than noise."""
-    views = scan.training_views
     binning = max(1, geometry.columns // 96)
-    coarse, small = geometry.binned(binning).select(views), grid.coarser(binning)
-    binned = likelihood_of(scan, views, binning=binning)
-    assert isinstance(binned, Poisson)
-    problem = Problem(coarse, binned, small)
+    problem = _problem(scan, geometry, grid.coarser(binning), {}, binning)
+    binned = problem.likelihood
+    if not isinstance(binned, Poisson):
+        return None
+    strength = settings.strength
     fit = reconstruct(problem, start(problem), strength=strength, passes=COARSE_PASSES, seconds=seconds)
-    integrals = Projector(coarse, small).forward(fit.volume, np.arange(len(views)))
+    integrals = Projector(problem.geometry, problem.grid).forward(fit.volume, np.arange(problem.geometry.views))
     factors = air_factors(binned, integrals)
     photons = torch.where(beside_object(binned, integrals), binned.counts, 0).sum(1)
     error = float((1 / photons.clamp_min(1)).sqrt().median())
     spread = float(factors.std()) if len(factors) > 1 else 0.0
-    if not forced and spread <= DRIFT * error:
+    if settings.air is not True and spread <= DRIFT * error:
         return None
     decisions.append(
         f"open beam: corrected per view; it varies by {100 * spread:.2f} % between views, of which noise explains "
         f"{100 * error:.2f} %"
     )
     return [float(f) for f in factors]
-
-
-def _coarse_start(
-    scan: Scan,
-    geometry: ScanGeometry,
-    grid: VoxelGrid,
-    factors: list[float] | None,
-    weights: tuple[float, float],
-    seconds: float | None,
-) -> Fit:
-    """Return a start for the fine grid, interpolated from a fit with voxels and pixels twice as large."""
-    views = scan.training_views
-    small = grid.coarser(2)
-    likelihood = likelihood_of(scan, views, binning=2)
-    strength, error = weights
-    if isinstance(likelihood, Poisson):
-        likelihood = likelihood.with_model_error(error)
-        likelihood = likelihood if factors is None else likelihood.scaled(torch.tensor(factors))
-    problem = Problem(geometry.binned(2).select(views), likelihood, small)
-    limit = None if seconds is None else COARSE_FRACTION * seconds
-    return finer(reconstruct(problem, start(problem), strength=strength, passes=COARSE_PASSES, seconds=limit), grid)
 
 
 def _better_start(coarse: Fit, problem: Problem, integrals: np.ndarray) -> Fit:
