@@ -27,9 +27,8 @@ from nerfcli.photos.images import (
     downscale,
     image_size,
     list_images,
-    list_unreadable,
+    list_photos,
     read_image,
-    skipped_files,
     write_png,
 )
 from nerfcli.poses.input.photos import find_photos
@@ -318,8 +317,8 @@ def test_files_that_are_no_photos_are_counted_by_their_suffix(tmp_path):
     names = ("a.jpg", "a.heic", "b.dng", "c.mov", "d.MOV", "e.txt", "README", ".DS_Store", "Thumbs.db", "below/f.mov")
     for name in names:
         (tmp_path / name).touch()
-    assert skipped_files(tmp_path) == "2 .mov, 1 .heic, 1 .txt, 1 without a suffix"
-    assert skipped_files(tmp_path, subfolders=True).startswith("3 .mov, ")
+    assert list_photos(tmp_path).skipped == "2 .mov, 1 .heic, 1 .txt, 1 without a suffix"
+    assert list_photos(tmp_path, subfolders=True).skipped.startswith("3 .mov, ")
     with pytest.raises(UserError) as caught:
         find_photos(tmp_path / "below")
     assert caught.value.hint.startswith("there are only 1 .mov; expected .jpg, .png, ")
@@ -395,7 +394,7 @@ def test_photos_in_formats_that_are_not_read_say_what_to_do(tmp_path, name, reas
     with pytest.raises(UserError, match=rf"{name} .*{reason}"):
         read_image(tmp_path / name)
     assert list_images(tmp_path) == []
-    assert [path.name for path in list_unreadable(tmp_path)] == [name]
+    assert [path.name for path in list_photos(tmp_path).unreadable] == [name]
 
 
 def downscaled_by_loops(image: np.ndarray, factor: float) -> np.ndarray:

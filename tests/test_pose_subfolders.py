@@ -109,14 +109,14 @@ def test_subfolders_are_searched_at_any_depth_but_not_hidden_ones(tmp_path: Path
     for folder in (".", "b", "a/deep", ".thumbnails", "b/.cache"):
         write_photos(tmp_path / folder, 1)
     (tmp_path / "b" / "raw.dng").write_bytes(b"")
-    found = [path.relative_to(tmp_path).as_posix() for path in list_photos(tmp_path, subfolders=True)]
+    found = [path.relative_to(tmp_path).as_posix() for path in list_photos(tmp_path, subfolders=True).pictures]
     assert found == ["0.png", "a/deep/0.png", "b/0.png"]
     write_photos(tmp_path / "b", 3)
     photos = find_photos(tmp_path, subfolders=True)
     assert set(photos.unreadable) == {"b/raw.dng"}
     assert len(photos.names) == 5
     assert [len(group) for group in camera_groups(photos.photos)] == [1, 1, 3]
-    assert list_photos(tmp_path) == [tmp_path / "0.png"]
+    assert list_photos(tmp_path).pictures == [tmp_path / "0.png"]
 
 
 @pytest.mark.parametrize(
@@ -195,5 +195,7 @@ def test_photos_behind_links_to_folders_are_found_once(tmp_path: Path):
     (tmp_path / "photos" / "again").symlink_to(tmp_path / "photos")
     (tmp_path / "photos" / "copy").symlink_to(tmp_path / "photos" / "right")
     (tmp_path / "photos" / "left").symlink_to(tmp_path / "elsewhere")
-    found = [path.relative_to(tmp_path).as_posix() for path in list_photos(tmp_path / "photos", subfolders=True)]
+    found = [
+        path.relative_to(tmp_path).as_posix() for path in list_photos(tmp_path / "photos", subfolders=True).pictures
+    ]
     assert found == ["photos/left/a.jpg", "photos/right/a.jpg"]

@@ -19,7 +19,7 @@ from nerfcli.doctor.pose_agreement import misplaced_groups, nearest_pairs, pair_
 from nerfcli.errors import UserError, in_shell
 from nerfcli.pages.findings import Finding, as_json, worst
 from nerfcli.photos.focal_evidence import focal_evidence, usual_focal_px
-from nerfcli.photos.images import list_photos, list_unreadable, name_in, skipped_files, where_photos_may_be
+from nerfcli.photos.images import list_photos, name_in, where_photos_may_be
 from nerfcli.poses.judge.checks import Checks
 
 
@@ -91,11 +91,12 @@ def find_subject(path: Path, *, subfolders: bool = False) -> ExaminedCapture:
             f"{path} is a file, neither a folder of photos nor a scene",
             f"if it is a video, nerfcli poses {in_shell(path)} writes its frames to a folder that can be given here",
         )
-    photos = [*list_photos(path, subfolders=subfolders), *list_unreadable(path, subfolders=subfolders)]
+    listed = list_photos(path, subfolders=subfolders)
+    photos = [*listed.pictures, *listed.unreadable]
     if not photos:
         raise UserError(f"no photos and no scene in {path}", where_photos_may_be(path))
     sources = tuple(Source(name_in(path, photo), photo) for photo in photos)
-    return ExaminedCapture(path, sources, None, skipped_files(path, subfolders=subfolders))
+    return ExaminedCapture(path, sources, None, listed.skipped)
 
 
 def estimated_seconds(count: int, threads: int) -> float:

@@ -76,7 +76,27 @@ def dense_depths(
     Source: Hirschmüller 2008, Stereo processing by semi-global matching, TPAMI 30(2); OpenCV's StereoSGBM.
     """
     faces = Faces.of(photos)
-    found = _depths_of(faces.photos, faces.tracks(tracks), longer_side_px=longer_side_px, threads=threads)
+    flat, tracks = faces.photos, faces.tracks(tracks)  # no panoramas
+    points, shown = _points_shown(flat, tracks)
+    near = _neighbours(points, shown, np.array([photo.frame.centre for photo in flat]))
+    own_threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # each thread processes a photo
+    try:
+        with ThreadPoolExecutor(max(1, threads)) as pool:
+            views = list(pool.map(lambda photo: view_of(photo, longer_side_px), flat))
+
+            def map_of(index: int) -> tuple[np.ndarray, np.ndarray]:
+                return _map(views[index], [views[other] for other in near[index]], points[shown[index]])
+
+            maps = list(pool.map(map_of, range(len(flat))))
+
+            def depth_of(index: int) -> DenseDepth:
+                others = [(views[other], maps[other][0]) for other in near[index]]
+                return _depth(flat[index], views[index], maps[index], others)
+
+            found = list(pool.map(depth_of, range(len(flat))))
+    finally:
+        cv2.setNumThreads(own_threads)
     depths = []
     for number in range(len(photos)):
         own = found[faces.own(number)]
@@ -84,31 +104,6 @@ def dense_depths(
         distances, errors = (np.concatenate([getattr(d, name) for d in own])[index] for name in ("distances", "errors"))
         depths.append(DenseDepth(pixels, distances, errors))
     return depths
-
-
-def _depths_of(photos: Sequence[LoadedPhoto], tracks: Tracks, *, longer_side_px: int, threads: int) -> list[DenseDepth]:
-    """Return `dense_depths` of photos that are no panoramas."""
-    points, shown = _points_shown(photos, tracks)
-    centres = np.array([photo.frame.centre for photo in photos])
-    near = _neighbours(points, shown, centres)
-    own_threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # each thread processes a photo
-    try:
-        with ThreadPoolExecutor(max(1, threads)) as pool:
-            views = list(pool.map(lambda photo: view_of(photo, longer_side_px), photos))
-
-            def map_of(index: int) -> tuple[np.ndarray, np.ndarray]:
-                return _map(views[index], [views[other] for other in near[index]], points[shown[index]])
-
-            maps = list(pool.map(map_of, range(len(photos))))
-
-            def depth_of(index: int) -> DenseDepth:
-                others = [(views[other], maps[other][0]) for other in near[index]]
-                return _depth(photos[index], views[index], maps[index], others)
-
-            return list(pool.map(depth_of, range(len(photos))))
-    finally:
-        cv2.setNumThreads(own_threads)
 
 
 def _points_shown(photos: Sequence[LoadedPhoto], tracks: Tracks) -> tuple[np.ndarray, np.ndarray]:

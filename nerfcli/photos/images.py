@@ -10,6 +10,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -333,37 +334,37 @@ def exif_entries(image: Image.Image, which: int | None) -> dict[int, Any]:
         return {}
 
 
-def list_photos(folder: Path, *, subfolders: bool = False) -> list[Path]:
-    """Return the picture files directly in a folder and, on request, in all of its subfolders, sorted by `name_in`.
+@dataclass(frozen=True)
+class Listing:
+    """The files of a folder of photos, each list sorted by `name_in`.
 
-    Raises:
-        UserError: see `list_images`.
+    Args:
+        pictures: as of `list_images`.
+        unreadable: photos in formats that cannot be read (raw, JPEG XL...), and broken links; not those with a readable
+            picture of the same name, apart from the suffix, beside them.
+        skipped: how many other files there are by suffix, such as "2 .mov, 1 .txt"; "" without any. Pictures in an
+            unusual format beside the same photo in a usual one count, too.
     """
-    paths = [path for each in _folders(folder, subfolders=subfolders) for path in list_images(each)]
-    return sorted(paths, key=lambda path: name_in(folder, path))
+
+    pictures: list[Path]
+    unreadable: list[Path]
+    skipped: str
 
 
-def list_unreadable(folder: Path, *, subfolders: bool = False) -> list[Path]:
-    """Return photos in formats that cannot be read (raw, JPEG XL...), and broken links, as `list_photos` does.
-
-    A file is left out if a readable picture of the same name, apart from the suffix, is beside it.
-    """
-    paths = [path for each in _folders(folder, subfolders=subfolders) for path in _unreadable(each)]
-    return sorted(paths, key=lambda path: name_in(folder, path))
-
-
-def skipped_files(folder: Path, *, subfolders: bool = False) -> str:
-    """Count the other files by their suffix, such as "2 .mov, 1 .txt"; "" without any.
-
-    Pictures in an unusual format beside the same photo in a usual one count, too.
-    """
-    counts = Counter[str]()
+def list_photos(folder: Path, *, subfolders: bool = False) -> Listing:
+    """List the photos directly in a folder and, on request, in all of its subfolders."""
+    pictures, unreadable, counts = list[Path](), list[Path](), Counter[str]()
     for each in _folders(folder, subfolders=subfolders):
-        used = {*list_images(each), *_unreadable(each)}
-        files = (path for path in each.iterdir() if path not in used and path.is_file())
+        read, unread = list_images(each), _unreadable(each)
+        pictures += read
+        unreadable += unread
+        files = (path for path in each.iterdir() if path not in {*read, *unread} and path.is_file())
         names = (path for path in files if not path.name.startswith(".") and path.name not in _OURS_OR_SYSTEM)
         counts.update(path.suffix.lower() or "without a suffix" for path in names)
-    return ", ".join(f"{count} {suffix}" for suffix, count in counts.most_common())
+    skipped = ", ".join(f"{count} {suffix}" for suffix, count in counts.most_common())
+    for paths in (pictures, unreadable):
+        paths.sort(key=lambda path: name_in(folder, path))
+    return Listing(pictures, unreadable, skipped)
 
 
 def name_in(folder: Path, path: Path) -> str:
@@ -379,7 +380,7 @@ def where_photos_may_be(folder: Path) -> str:
     if with_photos:
         more = f" and {len(with_photos) - 1} more folders" if len(with_photos) > 2 else f" and {with_photos[1]}"
         return f"there are photos in {with_photos[0]}{more}; give one of them, or use all with --subfolders"
-    there = f"there are only {skipped}; " if (skipped := skipped_files(folder)) else ""
+    there = f"there are only {skipped}; " if (skipped := list_photos(folder).skipped) else ""
     return f"{there}expected .jpg, .png, .heic, .tif, .webp or another of the {len(IMAGE_SUFFIXES)} suffixes of photos"
 
 

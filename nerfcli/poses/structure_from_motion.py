@@ -9,6 +9,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 from nerfcli.atomic import write_json
@@ -84,7 +85,8 @@ def estimate_poses(
         job = _lay_out(
             photos, _search_settings(settings, grouped), grouped=grouped, pairing=pairing, work=work, notify=notify
         )
-        _run(job, work, memory_bytes=memory_bytes, lock=lock, progress=progress, notify=notify)
+        solve = partial(run_worker, progress=progress, memory_bytes=memory_bytes, lock=lock, notify=notify)
+        _run(job, work, solve, notify)
         result = read_json(work / "result.json")["content"]  # written by the worker, or complete from before
         result["seconds"]["total"] = round(time.perf_counter() - start, 3)
         matching = {"rule": pairing.rule, "pairs": result["pairs"], **hash_named_files(settings)}
@@ -139,28 +141,13 @@ def photo_notes(photos: Photos, grouped: PhotoGroups) -> list[str]:
     return [*notes, *grouped.notes]
 
 
-def _run(
-    job: Job,
-    work: Path,
-    *,
-    memory_bytes: int | None,
-    lock: int,
-    progress: Callable[[str, int, int], None],
-    notify: Callable[[str], None],
-) -> None:
+def _run(job: Job, work: Path, solve: Callable[..., None], notify: Callable[[str], None]) -> None:
     """Run the worker; if a check ends it, run it again without that check, since the model is on disk by then."""
     while True:
         (work / UNDERWAY).unlink(missing_ok=True)
         write_job(work / "job.json", job)
         try:
-            run_worker(
-                work / "job.json",
-                threads=job.threads,
-                progress=progress,
-                memory_bytes=memory_bytes,
-                lock=lock,
-                notify=notify,
-            )
+            solve(work / "job.json", threads=job.threads)
             return
         except WorkerDiedError as error:
             if error.check is None:

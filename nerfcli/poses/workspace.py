@@ -118,7 +118,7 @@ def is_same_scene(
 def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: Calibration | None) -> bool:
     report = read_json(scene_dir / "poses_report.json")
     made = scene_dir.resolve() / read_json(scene_dir / SCENE_FILE)["image_folder"]
-    names = [name_in(photos_dir, path) for path in list_photos(photos_dir, subfolders=settings.subfolders)]
+    names = [name_in(photos_dir, path) for path in list_photos(photos_dir, subfolders=settings.subfolders).pictures]
     earlier = report.get("intrinsics")
     files = {key: value for key, value in report["matching"].items() if key.endswith("_key")}
     made_with = asdict(PoseSettings()) | report["settings"]  # settings newer than the report had their defaults

@@ -10,10 +10,8 @@ from nerfcli.photos.exif import Exif, read_exif
 from nerfcli.photos.focal_evidence import focal_evidence, same_focal, with_digital_zoom
 from nerfcli.photos.images import (
     list_photos,
-    list_unreadable,
     name_in,
     read_image,
-    skipped_files,
     where_photos_may_be,
 )
 from nerfcli.photos.panoramas import is_panorama
@@ -69,7 +67,8 @@ def find_photos(
         raise UserError(f"the folder {folder} does not exist", "give a folder of photos, or a video file")
     if not folder.is_dir():
         raise UserError(f"{folder} is a file, not a folder of photos", "give the folder that contains the photos")
-    paths = [*list_photos(folder, subfolders=subfolders), *list_unreadable(folder, subfolders=subfolders)]
+    listed = list_photos(folder, subfolders=subfolders)
+    paths = [*listed.pictures, *listed.unreadable]
     if not paths:
         raise UserError(f"no photos in {folder}", where_photos_may_be(folder))
     photos: list[Photo] = []
@@ -86,7 +85,7 @@ def find_photos(
         raise _too_few(folder, photos, unreadable)
     exifs = with_digital_zoom([photo.exif for photo in photos])
     zoomed = tuple(replace(photo, exif=exif) for photo, exif in zip(photos, exifs, strict=True))
-    return Photos(folder, zoomed, unreadable, skipped_files(folder, subfolders=subfolders))
+    return Photos(folder, zoomed, unreadable, listed.skipped)
 
 
 def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
