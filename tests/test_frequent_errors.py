@@ -24,8 +24,8 @@ def project(folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("files", "said"),
     [
-        ((), "expected .jpg, .png, .heic, "),
-        (("a.psd", "b.psd", "notes.txt"), "there are only 2 .psd, 1 .txt; expected .jpg, "),
+        ((), "expected photos, such as .jpg, .png, .heic, "),
+        (("a.psd", "b.psd", "notes.txt"), "there are only 2 .psd, 1 .txt; expected photos, such as .jpg, "),
         (("DCIM/a.jpg",), "there are photos in {0}/DCIM; give that folder"),
     ],
 )

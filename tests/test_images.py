@@ -321,7 +321,7 @@ def test_files_that_are_no_photos_are_counted_by_their_suffix(tmp_path):
     assert list_photos(tmp_path, subfolders=True).skipped.startswith("3 .mov, ")
     with pytest.raises(UserError) as caught:
         find_photos(tmp_path / "below")
-    assert caught.value.hint.startswith("there are only 1 .mov; expected .jpg, .png, ")
+    assert caught.value.hint.startswith("there are only 1 .mov; expected photos, such as .jpg, .png, ")
 
 
 @pytest.mark.parametrize("suffix", sorted(IMAGE_SUFFIXES))

@@ -12,7 +12,7 @@ from nerfcli.captures.formats.colmap import find_model, read_model
 from nerfcli.doctor.geometry import BASELINE_BAD, BASELINE_LOOK
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
-from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, verdict_below, worst
+from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, finding, verdict_below, worst
 from nerfcli.photos.exif import east_north_up
 from nerfcli.poses.judge.contradictions import FARTHEST
 from nerfcli.poses.model.reasons import FEW_FEATURES
@@ -41,7 +41,7 @@ def spread(scene: Capture) -> Finding:
     step = float(np.median(nearest.min(axis=1) / depths)) if len(centres) > 1 else 0.0
     verdict = worst([verdict_below(ratio, look=BASELINE_LOOK, bad=BASELINE_BAD), LOOK if far else GOOD])
     summary = f"camera spread / depth {ratio:.2f}, distance to the nearest camera / depth {step:.3f}"
-    advice = "" if verdict == GOOD else "step sideways between photos: depth is visible only if the camera moves"
+    advice = "step sideways between photos: depth is visible only if the camera moves"
     if far:
         summary += f"; {several(len(far), 'camera')} far from the others"
         advice = "check these poses: wrong ones ruin training; estimate poses again without these photos"
@@ -49,8 +49,8 @@ def spread(scene: Capture) -> Finding:
         f"camera spread / depth: look below {BASELINE_LOOK}, bad below {BASELINE_BAD}; a camera: look from "
         f"{FARTHEST:g} times the median distance"
     )
-    remarks = tuple((scene.frames[i].name, f"{distances[i] / typical:.0f} times the median distance") for i in far)
-    return Finding("camera spread", verdict, summary, ratio, threshold, advice, remarks)
+    remarks = [(scene.frames[i].name, f"{distances[i] / typical:.0f} times the median distance") for i in far]
+    return finding("camera spread", verdict, summary, ratio, threshold, advice=advice, photos=remarks)
 
 
 def directions(scene: Capture) -> Finding:
@@ -72,15 +72,15 @@ def directions(scene: Capture) -> Finding:
         verdict = verdict_below(span, look=_SPAN_LOOK, bad=_SPAN_BAD)
         summary = f"cameras in front of the scene, within {span:.0f} degrees; {high}"
         threshold = f"span: look below {_SPAN_LOOK:g} degrees, bad below {_SPAN_BAD:g}"
-        advice = "" if verdict == GOOD else "add photos from farther left, right, above and below"
-        return Finding("directions", verdict, summary, span, threshold, advice)
+        advice = "add photos from farther left, right, above and below"
+        return finding("directions", verdict, summary, span, threshold, advice=advice)
     widest = float(gaps.max())
     verdict = BAD if looks_in and widest >= _GAP_BAD else LOOK if looks_in and widest >= _GAP_LOOK else GOOD
     layout = "around the scene" if looks_in else "looking outwards"
     summary = f"cameras {layout}, widest gap {widest:.0f} degrees; {high}"
     threshold = f"gap around the scene: look from {_GAP_LOOK:g} degrees, bad from {_GAP_BAD:g}"
-    advice = "" if verdict == GOOD else "add photos in the gap: the scene is unknown from there"
-    return Finding("directions", verdict, summary, widest, threshold, advice)
+    advice = "add photos in the gap: the scene is unknown from there"
+    return finding("directions", verdict, summary, widest, threshold, advice=advice)
 
 
 def focal_lengths(scene: Capture) -> Finding:
@@ -93,14 +93,13 @@ def focal_lengths(scene: Capture) -> Finding:
     fractions = [frame.camera.focal_px / max(frame.camera.width, frame.camera.height) for frame in scene.frames]
     summary = f"{np.median(fractions):.2f} times the longer side, from the scene"
     threshold = f"difference along x and y: look from {100 * _ASPECT_LOOK:g} %"
-    if not stretched:
-        return Finding("focal length", GOOD, summary, apart[0][0], threshold)
-    summary += f"; {several(len(stretched), 'photo')} whose {stretched[0][1]}"
+    summary += f"; {several(len(stretched), 'photo')} whose {stretched[0][1]}" if stretched else ""
     advice = (
         "pixels of nearly all cameras are square: unless these photos were stretched, the calibration is wrong; "
         "estimate poses with nerfcli poses and compare held-out photos"
     )
-    return Finding("focal length", LOOK, summary, apart[0][0], threshold, advice, tuple(stretched))
+    verdict = LOOK if stretched else GOOD
+    return finding("focal length", verdict, summary, apart[0][0], threshold, advice=advice, photos=stretched)
 
 
 def points(scene: Capture) -> Finding | None:
@@ -112,12 +111,10 @@ def points(scene: Capture) -> Finding | None:
     few = sorted((count, name) for name, count in counts.items() if count < FEW_FEATURES)
     middle = float(np.median(list(counts.values()))) if counts else 0.0
     summary, threshold = f"{middle:.0f} 3D points in the median photo", f"per photo: look below {FEW_FEATURES}"
-    if not few:
-        return Finding("points", GOOD, summary, middle, threshold)
-    summary += f", {several(len(few), 'photo')} with few"
+    summary += f", {several(len(few), 'photo')} with few" if few else ""
     advice = "their poses are uncertain: check renderings from there"
-    remarks = tuple((name, several(count, "point")) for count, name in few)
-    return Finding("points", LOOK, summary, middle, threshold, advice, remarks)
+    remarks = [(name, several(count, "point")) for count, name in few]
+    return finding("points", LOOK if few else GOOD, summary, middle, threshold, advice=advice, photos=remarks)
 
 
 def intrinsics(scene: Capture) -> Finding | None:
@@ -136,10 +133,9 @@ def intrinsics(scene: Capture) -> Finding | None:
     if borders_px:
         accuracy += f", distortion ± {max(borders_px):.2g} px at the corners"
     threshold = "standard deviation: look from 1 % of the focal length, or 0.5 % of half the image diagonal"
-    if not weak:
-        return Finding("intrinsics", GOOD, accuracy, focal, threshold)
+    summary = f"intrinsics are weakly determined: {accuracy}" if weak else accuracy
     advice = "use nerfcli poses --intrinsics, or add photos from more directions and distances"
-    return Finding("intrinsics", LOOK, f"intrinsics are weakly determined: {accuracy}", focal, threshold, advice)
+    return finding("intrinsics", LOOK if weak else GOOD, summary, focal, threshold, advice=advice)
 
 
 def check_scene_files(scene: Capture) -> list[Finding]:

@@ -12,7 +12,7 @@ from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
 from nerfcli.matching.graph import connected_groups
 from nerfcli.matching.stationary import LEAST_FRACTION, together
-from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, verdict_below, worst
+from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, finding, verdict_above, verdict_below, worst
 from nerfcli.poses.model.reasons import FEW_MATCHES
 
 # Baseline over depth: 0.1 is an angle of 6 degrees between two rays to the same point.
@@ -57,8 +57,8 @@ def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding
         f"fraction of photos in the largest part: look below 1, bad below 0.9; per photo: look below {FEW_MATCHES} "
         f"matches with its best partner or fewer than 2 partners"
     )
-    advice = "" if verdict == GOOD else "add photos in between, so that each overlaps its neighbours by two thirds"
-    return Finding("connectivity", verdict, summary, fraction, threshold, advice, tuple(remarks))
+    advice = "add photos in between, so that each overlaps its neighbours by two thirds"
+    return finding("connectivity", verdict, summary, fraction, threshold, advice=advice, photos=remarks)
 
 
 def baselines(count: int, pairs: Sequence[Pair]) -> np.ndarray:
@@ -91,11 +91,9 @@ def movement(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding | N
     elif fraction > 0.1:
         summary += f"; {several(len(standing), 'photo')} without sideways movement to any other"
     threshold = f"baseline / depth with the best partner: look below {BASELINE_LOOK}, bad below {BASELINE_BAD}"
-    if verdict == GOOD:
-        return Finding("movement", GOOD, summary, middle, threshold)
     advice = "step sideways between photos by a tenth of the distance to the scene; turning shows no depth"
-    remarks = tuple((photos[i].name, f"baseline / depth {largest[i]:.3f}") for i in standing)
-    return Finding("movement", verdict, summary, middle, threshold, advice, remarks)
+    remarks = [(photos[i].name, f"baseline / depth {largest[i]:.3f}") for i in standing]
+    return finding("movement", verdict, summary, middle, threshold, advice=advice, photos=remarks)
 
 
 def flatness(pairs: Sequence[Pair]) -> Finding | None:
@@ -106,12 +104,11 @@ def flatness(pairs: Sequence[Pair]) -> Finding | None:
     fraction = float(np.mean([views.flat for views in moved]))
     summary = f"{100 * fraction:.0f} % of {len(moved)} pairs with movement show only a single plane"
     threshold = f"look from {_FLAT_LOOK:g}"
-    if fraction < _FLAT_LOOK:
-        return Finding("depth relief", GOOD, summary, fraction, threshold)
     advice = (
         "a flat scene does not determine the focal length: include objects at other distances, or give --intrinsics"
     )
-    return Finding("depth relief", LOOK, summary, fraction, threshold, advice)
+    verdict = verdict_above(fraction, look=_FLAT_LOOK, bad=np.inf)
+    return finding("depth relief", verdict, summary, fraction, threshold, advice=advice)
 
 
 def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:

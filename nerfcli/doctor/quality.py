@@ -8,7 +8,7 @@ from nerfcli.doctor.compared_pairs import FEWEST_PAIRS, Pair
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
 from nerfcli.matching.graph import connected_groups
-from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, verdict_above, verdict_below, worst
+from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, finding, verdict_above, verdict_below, worst
 
 # log2 of the detail that a photo lacks relative to the others: a Gaussian blur of about 0.8 px takes 0.3 from a sharp
 # photo of 1600 px, one of 1.5 px takes 0.7.
@@ -120,8 +120,6 @@ def exposure(photos: Sequence[PhotoFacts], brighter: np.ndarray) -> Finding:
     if np.isnan(spread) and len(settings) > 1:
         verdict = verdict_above(float(np.ptp(settings)), look=STOPS_LOOK, bad=STOPS_BAD)
     threshold = f"look from {STOPS_LOOK:g} stop, bad from {STOPS_BAD:g}"
-    if verdict == GOOD:
-        return Finding("exposure", GOOD, seen + text, spread, threshold)
     advice = (
         "fix the exposure in the camera and take all photos in one session; highlights and moving shadows have the "
         "same effect"
@@ -131,8 +129,8 @@ def exposure(photos: Sequence[PhotoFacts], brighter: np.ndarray) -> Finding:
             "the camera settings are constant, so the lighting changes or surfaces are shiny: avoid lamps and your "
             "shadow"
         )
-    remarks = tuple((photos[i].name, f"{brighter[i]:+.1f} stops") for i in off)
-    return Finding("exposure", verdict, seen + text, spread, threshold, advice, remarks)
+    remarks = [(photos[i].name, f"{brighter[i]:+.1f} stops") for i in off]
+    return finding("exposure", verdict, seen + text, spread, threshold, advice=advice, photos=remarks)
 
 
 def white_balance(photos: Sequence[PhotoFacts], redder: np.ndarray) -> Finding:
@@ -142,11 +140,9 @@ def white_balance(photos: Sequence[PhotoFacts], redder: np.ndarray) -> Finding:
     if np.isnan(spread):
         summary = "no matches to compare colours"
     threshold = f"look from {_BALANCE_LOOK:g} stops, bad from {_BALANCE_BAD:g}"
-    if verdict == GOOD:
-        return Finding("white balance", GOOD, summary, spread, threshold)
     advice = "fix the white balance in the camera; avoid coloured light"
-    remarks = tuple((photos[i].name, f"{redder[i]:+.2f} stops redder") for i in off)
-    return Finding("white balance", verdict, summary, spread, threshold, advice, remarks)
+    remarks = [(photos[i].name, f"{redder[i]:+.2f} stops redder") for i in off]
+    return finding("white balance", verdict, summary, spread, threshold, advice=advice, photos=remarks)
 
 
 def _differences(values: np.ndarray, *, look: float, bad: float) -> tuple[float, str, list[int]]:

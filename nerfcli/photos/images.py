@@ -342,8 +342,7 @@ class Listing:
         pictures: as of `list_images`.
         unreadable: photos in formats that cannot be read (raw, JPEG XL...), and broken links; not those with a readable
             picture of the same name, apart from the suffix, beside them.
-        skipped: how many other files there are by suffix, such as "2 .mov, 1 .txt"; "" without any. Pictures in an
-            unusual format beside the same photo in a usual one count, too.
+        skipped: the other files by suffix, such as "2 .mov, 1 .txt", and pictures that are there in a usual format too.
     """
 
     pictures: list[Path]
@@ -381,7 +380,7 @@ def where_photos_may_be(folder: Path) -> str:
         more = f" and {len(with_photos) - 1} more folders" if len(with_photos) > 2 else f" and {with_photos[1]}"
         return f"there are photos in {with_photos[0]}{more}; give one of them, or use all with --subfolders"
     there = f"there are only {skipped}; " if (skipped := list_photos(folder).skipped) else ""
-    return f"{there}expected .jpg, .png, .heic, .tif, .webp or another of the {len(IMAGE_SUFFIXES)} suffixes of photos"
+    return f"{there}expected photos, such as .jpg, .png, .heic, .tif or .webp"
 
 
 def _folders(folder: Path, *, subfolders: bool) -> list[Path]:
