@@ -732,7 +732,8 @@ def test_photos_of_a_path_are_wrong_usage_for_other_views(finished):
     assert nerfcli("render", finished, "--through", "r_001.png").exit_code == 2
 
 
-def test_run_trains_a_capture_with_the_poses_that_it_has(monkeypatch, capture):
+@pytest.mark.parametrize("is_archive", [False, True])
+def test_run_trains_a_capture_with_the_poses_that_it_has(monkeypatch, capture, is_archive):
     trained = []
 
     def only_asked(scene: Path, output: Output, *given: object, **more: object) -> None:
@@ -740,10 +741,12 @@ def test_run_trains_a_capture_with_the_poses_that_it_has(monkeypatch, capture):
         raise UserError("enough", "of this test")
 
     monkeypatch.setattr("nerfcli.workflows.train.train_scene", only_asked)
-    result = nerfcli("run", capture)
+    given = Path(shutil.make_archive(str(capture), "zip", capture)) if is_archive else capture
+    result = nerfcli("run", given)
     assert error_of(result)[0] == "Error: enough"
-    assert trained == [(capture, capture.with_name("spheres-run"))]
-    assert f"{capture} has poses (" in result.stderr
+    scene = capture.with_name("spheres-unpacked") if is_archive else capture
+    assert trained == [(scene, capture.with_name("spheres-run"))]
+    assert f"{given} has poses (" in result.stderr
     assert result.stdout == ""
 
 

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from nerfcli.captures.archives import unpacked
 from nerfcli.captures.formats.registry import recognised
 from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
@@ -81,26 +82,25 @@ def run_pipeline(
     usual_training = TrainSettings(budget_seconds=120.0, model="auto", **sizes_for(device))
     settings = replace(training or usual_training, threads=resources.cores, device=device)
 
-    scene, found = Path(photos), recognised(Path(photos))
-    if found is not None:
-        reporter.note(f"{scene} has poses ({found[0].of}), which are used; for new ones, give the folder of its photos")
-    else:
-        scene = estimate_poses(
-            photos,
-            Output(None if output.path is None else Path(output.path) / "scene", again),
-            replace(poses, threads=resources.cores),
-            frames=frames,
-            intrinsics=intrinsics,
-            resources=resources,
-            reporter=reporter,
-        )
-    run_path = beside(without_suffix(scene), "-run") if output.path is None else Path(output.path) / "run"
+    scene_output = Output(None if output.path is None else Path(output.path) / "scene", again)
+    capture = _capture_of(Path(photos), scene_output, reporter)
+    scene = capture or estimate_poses(
+        photos,
+        scene_output,
+        replace(poses, threads=resources.cores),
+        frames=frames,
+        intrinsics=intrinsics,
+        resources=resources,
+        reporter=reporter,
+    )
+    named = without_suffix(Path(photos) if capture else scene)
+    run_path = beside(named, "-run") if output.path is None else Path(output.path) / "run"
     with reporter.stage(f"train {scene.name}") as stage:
         run = _trained(scene, Output(run_path, again), settings, resources, stage)
     usual = Output(overwrite=again)
     with reporter.stage("evaluate") as stage:
         evaluation = evaluate_run(run.path, usual, resources=resources, reporter=stage)
-    for result in (run.path, evaluation) if found else (scene, run.path, evaluation):
+    for result in (run.path, evaluation) if capture else (scene, run.path, evaluation):
         show(result)
 
     splats = default_target(run.path, "splats")
@@ -127,6 +127,16 @@ def run_pipeline(
         report = report_runs([run.path], usual, keep=True, resources=resources, reporter=stage)
     show(report)
     return PipelineResult(scene, run, evaluation, splats, of_splats, renders, report)
+
+
+def _capture_of(photos: Path, output: Output, reporter: Reporter) -> Path | None:
+    """Return the folder of the capture with poses that was given, from a zip archive if it is one; None for photos."""
+    folder = unpacked(photos, output.beside(photos, "-scene"), overwrite=output.overwrite, reporter=reporter)
+    found = recognised(folder)
+    if found is None:
+        return None
+    reporter.note(f"{photos} has poses ({found[0].of}), which are used; for new ones, give the folder of its photos")
+    return folder
 
 
 def _trained(scene: Path, output: Output, settings: TrainSettings, resources: Resources, stage: Reporter) -> Run:
