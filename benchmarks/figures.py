@@ -233,10 +233,9 @@ def page(cells: Sequence[Cell]) -> str:
     usual = Counter(map(origin, measured)).most_common(1)[0][0]
     dates = sorted(cell["date"] for cell in measured if origin(cell) == usual)
 
-    def title(name: str, row: Iterable[Cell]) -> str:
-        """Return the title of a row, with the origin of cells that are from elsewhere than the page."""
-        others = {f"{', '.join(origin(one))}, {day(one['date'])}" for one in row if one and origin(one) != usual}
-        return "; ".join([name, *sorted(others)])
+    def mark(cell: Cell) -> str:
+        """Return a dagger for a cell that was measured elsewhere than the others."""
+        return " †" if cell and origin(cell) != usual else ""
 
     def of(kind: str, name: str, budget: float | None = None) -> Cell:
         """Return a cell, without numbers if it was not measured."""
@@ -251,7 +250,8 @@ def page(cells: Sequence[Cell]) -> str:
         commit=usual[0],
         processor=usual[1],
         dates=" to ".join(dict.fromkeys(day(iso) for iso in (dates[0], dates[-1]))),
-        title=title,
+        mark=mark,
+        others="; ".join(sorted({f"{', '.join(origin(one))}, {day(one['date'])}" for one in measured if mark(one)})),
         of=of,
         text=text,
         day=day,
