@@ -18,8 +18,9 @@ from typer.testing import CliRunner
 from nerfcli.atomic import read_sealed, write_sealed
 from nerfcli.cli import app
 from nerfcli.ct.export import VolumeFile, export_scan, read_volume, write_volume
-from nerfcli.ct.grid import UNSEEN, VoxelGrid, centred_grid
+from nerfcli.ct.grid import VoxelGrid, centred_grid
 from nerfcli.ct.likelihood import Gaussian, Poisson
+from nerfcli.ct.marks import UNSEEN
 from nerfcli.ct.recognise import DESCRIPTION
 from nerfcli.ct.render import residual_of, slice_of
 from nerfcli.ct.result import ReconstructionSettings, load_reconstruction

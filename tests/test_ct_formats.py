@@ -12,9 +12,9 @@ from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.formats.read import read_scan
 from nerfcli.ct.formats.statement import ScanOptions
 from nerfcli.ct.geometry import Circle, ScanGeometry, circle_of
-from nerfcli.ct.grid import load_truth
 from nerfcli.ct.recognise import recognise
 from nerfcli.ct.scan import load_scan
+from nerfcli.ct.truth import load_truth
 
 
 def differences(one: Circle, other: Circle) -> dict[str, float]:

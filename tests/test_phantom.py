@@ -12,8 +12,8 @@ from commands import error_of, nerfcli
 from ellipsoids import Ellipsoid, attenuation_at, attenuation_of_voxels, bean, line_integrals
 
 from nerfcli.ct.formats.read import read_scan
-from nerfcli.ct.grid import load_truth
 from nerfcli.ct.likelihood import likelihood_of
+from nerfcli.ct.truth import load_truth
 
 PHANTOM = Path(__file__).parent.parent / "sample_scenes" / "phantom"
 

@@ -43,7 +43,7 @@ from nerfcli.captures.scale import (
 )
 from nerfcli.captures.world import transformed
 from nerfcli.errors import UserError
-from nerfcli.photos.exif import Position, east_north_up, ecef
+from nerfcli.photos.geodesy import Position, east_north_up, ecef
 from nerfcli.photos.images import write_png
 
 few = examples(20)

@@ -88,7 +88,7 @@ def test_a_gain_that_rests_on_a_few_photos_is_not_clear():
     lucky = Trial(errors, base[0].halfway, base[0].counts, 1.0, 100)
     decision = judged(base, [lucky, lucky])
     assert decision.gain_db is not None
-    assert decision.gain_db > 3 * 0.05
+    assert decision.gain_db > 3 * ADDITION.least_db
     assert decision.error_db == pytest.approx(decision.gain_db, rel=1e-9)
     assert not decision.kept
 
@@ -97,7 +97,7 @@ def test_a_gain_that_rests_on_a_few_photos_is_not_clear():
 def test_gains_that_differ_as_much_as_they_are_large_are_not_kept(first, second):
     """Two gains of mean m and distance d have an error of d / 2; kept if m exceeds the least gain by two errors."""
     decision = judged([trial(20.0), trial(20.0)], [trial(20.0 + first), trial(20.0 + second)])
-    expected = (reported(first) + reported(second)) / 2 > 0.05 + abs(reported(first) - reported(second))
+    expected = (reported(first) + reported(second)) / 2 > ADDITION.least_db + abs(reported(first) - reported(second))
     assert decision.kept == expected
 
 
@@ -118,8 +118,8 @@ def test_what_is_left_out_must_surely_not_be_missed(changed, kept, why):
 
 
 def test_one_seed_is_enough_only_where_the_gain_is_clear():
-    """All photos gain alike, so the error is `SEED_DB`: the gain must exceed the least gain by five of it."""
-    least = 0.05 + 5.0 * SEED_DB
+    """All photos gain alike, so the error is `SEED_DB`: the gain must exceed the least by `errors_of_one` of it."""
+    least = ADDITION.least_db + ADDITION.errors_of_one * SEED_DB
     for gain, kept in ((1.1 * least, False), (1.5 * least, True)):
         decision = judged([trial(20.0)], [trial(20.0 + gain)])
         assert decision.gain_db == pytest.approx(reported(gain), abs=1e-9)

@@ -160,17 +160,17 @@ def run(spheres_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_export_refines_once_and_writes_every_format(run: Path) -> None:
     """The .ply and .spz hold the same scene, whichever frame they are in; the second export uses the first's splats."""
-    told: list[str] = []
-    shown: list[str] = []
-    reporter = Reporter(note=told.append, progress=lambda fraction, detail: shown.append(detail))
+    notes: list[str] = []
+    details: list[str] = []
+    reporter = Reporter(note=notes.append, progress=lambda fraction, detail: details.append(detail))
     ply = nerfcli.export_run(run, to="splats", splats=SMALL, reporter=reporter)
     # The budget counts down; what comes before it says nothing about its speed.
     budget = duration(SMALL.budget_seconds)
-    assert f"depths of the training photos, {budget} of refinement left" in shown
-    assert f"pictures of the field, {budget} of refinement left" in shown
-    assert re.fullmatch(r"refines \d+ splats, 0 s left", shown[-1])
+    assert f"depths of the training photos, {budget} of refinement left" in details
+    assert f"pictures of the field, {budget} of refinement left" in details
+    assert re.fullmatch(r"refines \d+ splats, 0 s left", details[-1])
     assert ply == run.with_name("spheres-run-splats.ply")
-    assert any("training photos: field" in line for line in told)
+    assert any("training photos: field" in line for line in notes)
     state = (run / SPLATS).read_bytes()
     for name, frame in (("a.spz", "viewer"), ("b.ply", "scene")):
         nerfcli.export_run(run, Output(run.with_name(name)), to="splats", splats=replace(SMALL, frame=frame))

@@ -18,7 +18,8 @@ from nerfcli.cameras.alignment import align, align_robustly
 from nerfcli.cameras.frame import Frame, frames_named
 from nerfcli.cameras.layout import centres_of
 from nerfcli.errors import UserError
-from nerfcli.photos.exif import Position, east_north_up, read_exif
+from nerfcli.photos.exif import read_exif
+from nerfcli.photos.geodesy import Position, east_north_up
 
 # Least ratio of the places' spread to their noise; pure noise, part of which a similarity fits, reaches 1.7 with 6
 # places and 1.1 with 20.

@@ -13,12 +13,13 @@ from nerfcli.atomic import read_json, write_json
 from nerfcli.ct.baselines import filtered_back_projection, logarithms, sart_total_variation
 from nerfcli.ct.calibrate import air_factors
 from nerfcli.ct.geometry import ScanGeometry
-from nerfcli.ct.grid import VoxelGrid, load_truth
+from nerfcli.ct.grid import VoxelGrid
 from nerfcli.ct.likelihood import Poisson, likelihood_of
 from nerfcli.ct.recognise import MEASUREMENT
 from nerfcli.ct.reconstruct import Projector
 from nerfcli.ct.result import METRICS, Reconstruction, load_reconstruction, scan_of
 from nerfcli.ct.scan import Scan
+from nerfcli.ct.truth import load_truth
 from nerfcli.errors import UserError
 from nerfcli.machine import Resources
 from nerfcli.notices import Reporter

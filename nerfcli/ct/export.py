@@ -16,7 +16,8 @@ import numpy as np
 import tifffile
 
 from nerfcli.atomic import atomic_path
-from nerfcli.ct.grid import MEANINGS, UNSEEN, VoxelGrid, marks_in_words
+from nerfcli.ct.grid import VoxelGrid
+from nerfcli.ct.marks import MEANINGS, UNSEEN, marks_in_words
 from nerfcli.ct.recognise import VOLUMES
 from nerfcli.ct.result import load_reconstruction
 from nerfcli.errors import UserError

@@ -13,7 +13,7 @@ from nerfcli.doctor.geometry import BASELINE_BAD, BASELINE_LOOK
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, finding, verdict_below, worst
-from nerfcli.photos.exif import east_north_up
+from nerfcli.photos.geodesy import east_north_up
 from nerfcli.poses.judge.contradictions import FARTHEST
 from nerfcli.poses.model.reasons import FEW_FEATURES
 

@@ -13,9 +13,9 @@ from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
 from nerfcli.ct.formats.pictures import read_npy
 from nerfcli.ct.formats.statement import ScanOptions, Statement, angles_in_radians, read_object
 from nerfcli.ct.geometry import Circle
-from nerfcli.ct.grid import described_truth
 from nerfcli.ct.recognise import R2_GAUSSIAN
 from nerfcli.ct.scan import Scan
+from nerfcli.ct.truth import described_truth
 from nerfcli.errors import UserError
 
 _HINT = "expected R2-Gaussian's meta_data.json: scanner, proj_train and proj_test"

@@ -35,10 +35,10 @@ from nerfcli.ct.formats.assemble import ReaderOutput, scan_of
 from nerfcli.ct.formats.pictures import SUFFIXES, numbered, read_npy, read_stack
 from nerfcli.ct.formats.statement import ScanOptions, Statement, angles_in_radians, millimetres, read_object
 from nerfcli.ct.geometry import Beam, Circle, ScanGeometry, from_vectors
-from nerfcli.ct.grid import described_truth
 from nerfcli.ct.open_beam import OpenBeam, check_sizes, open_beam_of
 from nerfcli.ct.recognise import STACK
 from nerfcli.ct.scan import KINDS, Kind, Scan
+from nerfcli.ct.truth import described_truth
 from nerfcli.errors import UserError
 
 _HINT = "a scan.json states projections, kind, beam, pixel_size, unit and angles_deg; see nerfcli's guide of tomography"

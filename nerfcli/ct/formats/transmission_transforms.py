@@ -15,9 +15,9 @@ from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
 from nerfcli.ct.formats.pictures import read_npy, read_stack
 from nerfcli.ct.formats.statement import ScanOptions, Statement, read_object
 from nerfcli.ct.geometry import ScanGeometry, circle_of
-from nerfcli.ct.grid import described_truth
 from nerfcli.ct.recognise import TRANSFORMS, TRANSFORMS_GEOMETRY
 from nerfcli.ct.scan import Scan
+from nerfcli.ct.truth import described_truth
 from nerfcli.errors import UserError
 
 WHITE = 65535.0

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.errors import UserError
-from nerfcli.photos.exif import east_north_up
+from nerfcli.photos.geodesy import east_north_up
 from nerfcli.poses.input.photos import Photo, Photos
 
 # Choices. "auto" selects one of the others, by the number of photos and their metadata.
