@@ -25,15 +25,11 @@ from rich.table import Table
 
 from nerfcli import kernels
 from nerfcli.captures.loading import load_scene
-from nerfcli.evaluate.photos import HeldOutPhoto
+from nerfcli.evaluate.photos import held_out_photos
 from nerfcli.evaluate.protocol import evaluate_model
-from nerfcli.photos.loading import load_photos
-from nerfcli.render.held_out_exposure import log_gains_of
-from nerfcli.render.model import load_model
 from nerfcli.training.loop import Progress, train
 from nerfcli.training.runs.components import Components, choose, differences
-from nerfcli.training.runs.files import FIELD
-from nerfcli.training.runs.run import read_config
+from nerfcli.training.runs.run import Run
 from nerfcli.training.runs.settings import TrainSettings
 
 # Scene, downscale, and the choices to compare, the baseline first. "-name" is --without, "auto" is --model auto.
@@ -96,14 +92,9 @@ def fit(folder: Path, choice: str, *, seed: int, steps: int, downscale: int, sam
 
     with tempfile.TemporaryDirectory() as run:
         train(capture, Path(run), settings, resume=False, notify=lambda text: None, on_progress=clock)
-        model = load_model(Path(run) / FIELD, "cpu")
-        picked = differences(read_config(Path(run)).components)
-    photos = load_photos(capture.test_frames, factor=downscale, threads=1, masks=components.masks)
-    gains = log_gains_of(capture.test_frames, model).tolist()
-    held_out = [
-        HeldOutPhoto(photo.frame, photo.pixels, photo.used, log_gains=tuple(gain))
-        for photo, gain in zip(photos, gains, strict=True)
-    ]
+        trained = Run(Path(run))
+        model, picked = trained.model(), differences(trained.components)
+        held_out = held_out_photos(trained, capture.test_frames, threads=1)
     mean = evaluate_model(model, held_out, on_image=lambda done, total: None).mean
     found = " ".join(f"{name}={value}" for name, value in picked.items())
     return Trained(folder.name, choice or "default", found, seed, steps, mean.psnr, mean.ssim or 0.0, used, samples)

@@ -31,6 +31,7 @@ from nerfcli.training.loop import Progress, train
 from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.preparation import EarlierDecisions, prepare
 from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.run import Run
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.step import light_from_beyond
 
@@ -330,7 +331,7 @@ def test_a_run_keeps_background_and_exposures_and_goes_on_bit_for_bit(capture, t
     model = load_model(tmp_path / "parts" / "field.safetensors", "cpu")
     assert isinstance(model.background, SphereBackground)
     assert torch.equal(model.background.logits, states[0]["parts.background.logits"])
-    assert model.log_exposure == pytest.approx(mean_log_exposure(capture.train_frames))
+    assert Run(tmp_path / "parts").exposures.log_exposure == pytest.approx(mean_log_exposure(capture.train_frames))
 
 
 def test_empty_space_shows_the_background_by_direction_whatever_the_tile(capture, tmp_path, monkeypatch):

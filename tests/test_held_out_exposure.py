@@ -1,8 +1,9 @@
 """Exposures of held-out photos from neighbouring photos: closed forms, and storing them in a run and using them."""
 
+import json
 import math
+from dataclasses import asdict, replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,16 +12,18 @@ from PIL import ExifTags, Image
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.render.held_out_exposure import (
+from nerfcli.field.checkpoint import load_tensors, save_tensors
+from nerfcli.photos.held_out_exposure import (
+    PhotoExposures,
     exif_slope,
     gain_sources,
     gains_between,
     gains_beyond_exif,
     log_gains_of,
 )
-from nerfcli.render.model import Model, load_model
 from nerfcli.training.loop import train
 from nerfcli.training.runs.components import Components
+from nerfcli.training.runs.run import Run
 from nerfcli.training.runs.settings import TrainSettings
 
 
@@ -132,8 +135,8 @@ def test_two_photos_give_no_estimate_and_are_refused():
     assert gains_between(np.arange(4), drifting(np.arange(4.0)), np.zeros(0)).shape == (0, 3)
 
 
-def trained(scene: Capture, run: Path, *, exposure: str) -> Model:
-    """Return the field of a short training."""
+def trained(scene: Capture, run: Path, *, exposure: str) -> PhotoExposures:
+    """Return the exposures that a short training finds."""
     settings = TrainSettings(
         budget_seconds=None,
         steps=150,
@@ -144,7 +147,7 @@ def trained(scene: Capture, run: Path, *, exposure: str) -> Model:
         threads=1,
     )
     train(scene, run, settings, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
-    return load_model(run / "field.safetensors", "cpu")
+    return Run(run).exposures
 
 
 def test_training_estimates_exposures_of_held_out_photos_without_opening_them(tmp_path: Path):
@@ -159,12 +162,12 @@ def test_training_estimates_exposures_of_held_out_photos_without_opening_them(tm
         pose[:3, 3] = [0.1 * index, 0.0, -2.0]
         frames.append(Frame(f"{index}.png", camera, pose, tmp_path / f"{index}.png"))
     scene = Capture(tuple(frames), np.zeros((9, 3)), kind="colmap", root=tmp_path, test_names=frozenset({"7.png"}))
-    model = trained(scene, tmp_path / "run", exposure="learned")
-    assert set(model.exposures) == {"7.png"}
-    reported = log_gains_of(scene.test_frames, model)
-    assert reported.tolist() == [list(model.exposures["7.png"])]
+    known = trained(scene, tmp_path / "run", exposure="learned")
+    assert set(known.exposures) == {"7.png"}
+    reported = log_gains_of(scene.test_frames, known)
+    assert reported.tolist() == [known.exposures["7.png"]]
     assert reported.mean() == pytest.approx(log_ratio(144, 107), rel=0.3)
-    assert log_gains_of(scene.train_frames, model) == pytest.approx(np.zeros((8, 3)))  # there is no EXIF
+    assert log_gains_of(scene.train_frames, known) == pytest.approx(np.zeros((8, 3)))  # there is no EXIF
 
 
 @pytest.mark.parametrize("exposure", ["matched", "learned"])
@@ -193,37 +196,52 @@ def test_a_run_keeps_the_offset_to_exif_of_held_out_photos(tmp_path: Path, expos
         pose[:3, 3] = [0.1 * index, 0.0, -2.0]
         frames.append(Frame(path.name, camera, pose, path))
     scene = Capture(tuple(frames), np.zeros((13, 3)), kind="colmap", root=tmp_path, test_names=frozenset({"9.png"}))
-    model = trained(scene, tmp_path / "run", exposure=exposure)
-    assert gain_sources(scene.test_frames, model) == ["EXIF and training photos around"]
-    assert set(model.beyond_exif) == {"9.png"}
-    assert np.mean(model.beyond_exif["9.png"]) == pytest.approx(drift[9], abs=0.12)
-    assert log_gains_of(scene.test_frames, model).mean() == pytest.approx(drift[9] + jumps[9], abs=0.15)
+    known = trained(scene, tmp_path / "run", exposure=exposure)
+    assert gain_sources(scene.test_frames, known) == ["EXIF and training photos around"]
+    assert set(known.beyond_exif) == {"9.png"}
+    assert np.mean(known.beyond_exif["9.png"]) == pytest.approx(drift[9], abs=0.12)
+    assert log_gains_of(scene.test_frames, known).mean() == pytest.approx(drift[9] + jumps[9], abs=0.15)
 
 
 def test_exif_of_a_held_out_photo_takes_precedence_over_its_neighbours(monkeypatch):
     """EXIF has the exposure of one photo only; a model without a mean exposure does not use it."""
     frames = [Frame(name, Camera.pinhole(4, 4, 4.0), np.eye(4)) for name in ("a", "b", "c")]
     monkeypatch.setattr(
-        "nerfcli.render.held_out_exposure.log_exposures", lambda frames: np.array([1.5, np.nan, np.nan])[: len(frames)]
+        "nerfcli.photos.held_out_exposure.log_exposures", lambda frames: np.array([1.5, np.nan, np.nan])[: len(frames)]
     )
     around = {"a": (9.0, 9.0, 9.0), "b": (0.1, 0.2, 0.3)}
-    model = SimpleNamespace(log_exposure=1.0, exif_slope=1.0, exposures=around, beyond_exif={})
-    assert log_gains_of(frames, model).tolist() == [[0.5] * 3, [0.1, 0.2, 0.3], [0.0] * 3]  # type: ignore[arg-type]
-    assert gain_sources(frames, model) == ["EXIF", "training photos around", "their mean"]  # type: ignore[arg-type]
-    model.exif_slope = 0.6
-    assert log_gains_of(frames, model).tolist()[:2] == [[pytest.approx(0.3)] * 3, [0.1, 0.2, 0.3]]  # type: ignore[arg-type]
-    model.beyond_exif = {"a": (0.1, 0.0, -0.1), "b": (5.0, 5.0, 5.0)}
-    assert log_gains_of(frames, model)[0].tolist() == pytest.approx([0.4, 0.3, 0.2])  # type: ignore[arg-type]
-    assert log_gains_of(frames, model)[1].tolist() == [0.1, 0.2, 0.3]  # type: ignore[arg-type]
+    known = PhotoExposures(log_exposure=1.0, exposures=around)
+    assert log_gains_of(frames, known).tolist() == [[0.5] * 3, [0.1, 0.2, 0.3], [0.0] * 3]
+    assert gain_sources(frames, known) == ["EXIF", "training photos around", "their mean"]
+    flatter = replace(known, exif_slope=0.6)
+    assert log_gains_of(frames, flatter).tolist()[:2] == [[pytest.approx(0.3)] * 3, [0.1, 0.2, 0.3]]
+    beyond = replace(flatter, beyond_exif={"a": (0.1, 0.0, -0.1), "b": (5.0, 5.0, 5.0)})
+    assert log_gains_of(frames, beyond)[0].tolist() == pytest.approx([0.4, 0.3, 0.2])
+    assert log_gains_of(frames, beyond)[1].tolist() == [0.1, 0.2, 0.3]
     sources = ["EXIF and training photos around", "training photos around", "their mean"]
-    assert gain_sources(frames, model) == sources  # type: ignore[arg-type]
-    model.exif_slope = 0.0
-    assert log_gains_of(frames, model).tolist()[0] == [9.0] * 3  # type: ignore[arg-type]
-    model = SimpleNamespace(log_exposure=None, exif_slope=1.0, exposures=around, beyond_exif={})
-    assert log_gains_of(frames, model).tolist()[0] == [9.0] * 3  # type: ignore[arg-type]
-    assert gain_sources(frames, model)[0] == "training photos around"  # type: ignore[arg-type]
-    model = SimpleNamespace(log_exposure=None, exif_slope=1.0, exposures={}, beyond_exif={})
-    assert gain_sources(frames, model) == ["none"] * 3  # type: ignore[arg-type]
+    assert gain_sources(frames, beyond) == sources
+    for unused in (replace(beyond, exif_slope=0.0), PhotoExposures(exposures=around)):
+        assert log_gains_of(frames, unused).tolist()[0] == [9.0] * 3
+        assert gain_sources(frames, unused)[0] == "training photos around"
+    assert gain_sources(frames, PhotoExposures()) == ["none"] * 3
+
+
+def test_exposures_of_a_run_of_an_earlier_version_are_read_from_the_file_of_its_field(finished: Path):
+    """Its description had these four keys, and cameras.json none of them."""
+    known = {
+        "log_exposure": -1.5,
+        "exif_slope": 0.7,
+        "exposures": {"a": [0.1, 0.2, 0.3]},
+        "beyond_exif": {"b": [0.0] * 3},
+    }
+    tensors, description = load_tensors(finished / "field.safetensors", "cpu")
+    assert not known.keys() & description.keys()
+    save_tensors(finished / "field.safetensors", tensors, description | known)
+    assert Run(finished).exposures == PhotoExposures()
+    cameras = json.loads((finished / "cameras.json").read_text())
+    del cameras["exposures"], cameras["blake2b"]
+    (finished / "cameras.json").write_text(json.dumps(cameras))
+    assert asdict(Run(finished).exposures) == known
 
 
 def log_ratio(one: int, other: int) -> float:

@@ -25,7 +25,7 @@ from nerfcli.bench.results import Point, spread
 from nerfcli.captures.loading import load_scene
 from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import compare
-from nerfcli.evaluate.photos import HeldOutPhoto, background_of, held_out_photos_of, paired
+from nerfcli.evaluate.photos import HeldOutPhoto, background_of, held_out_photos, paired
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.photos.images import downscale
 from nerfcli.photos.loading import downscaled_camera
@@ -215,7 +215,7 @@ def measure_renderings(run: Run, *, device: str, threads: int, seconds: float, s
         return min(1.0, (time.monotonic() - began) / seconds)
 
     model = run.model(device)
-    photos = held_out_photos_of(run.config, run.cameras.test, model, threads=threads)
+    photos = held_out_photos(run, run.cameras.test, threads=threads)
     if not photos:
         raise UserError(f"{run.path} has no held-out photos", "by default every 8th photo is held out; check the split")
     settings = render_settings(threads)
@@ -292,7 +292,7 @@ def measure_trainings(
             train(scene, folder, wanted, resume=False, notify=lambda text: None, on_progress=on_progress)
             trained = Run(folder)
             model, summary = trained.model(device), trained.summary
-            photos = held_out_photos_of(trained.config, scene.test_frames, model, threads=threads)
+            photos = held_out_photos(trained, scene.test_frames, threads=threads)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
         assert summary is not None

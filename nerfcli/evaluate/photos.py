@@ -22,12 +22,11 @@ from nerfcli.evaluate.billboards import Billboards, reduction
 from nerfcli.evaluate.metrics import to_8_bit
 from nerfcli.field.background import Background
 from nerfcli.field.exposure import exposed
+from nerfcli.photos.held_out_exposure import gain_sources, log_gains_of
 from nerfcli.photos.images import write_png
 from nerfcli.photos.loading import downscaled_camera, load_photos
-from nerfcli.render.held_out_exposure import gain_sources, log_gains_of
-from nerfcli.render.model import Model
 from nerfcli.render.pictures import Renderable, RenderedPicture
-from nerfcli.training.runs.run import Run, RunConfig
+from nerfcli.training.runs.run import Run
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class HeldOutPhoto:
         frame: its camera and pose.
         pixels: (H, W, 3 or 4) uint8 sRGB, straight alpha.
         used: (H, W) bool; None for all pixels.
-        log_gains: logarithms of its gains relative to the model's pictures, from EXIF or from the training photos
+        log_gains: logarithms of its gains relative to rendered pictures, from EXIF or from the training photos
             around it, never from the photo itself; see `field.exposure`.
         gains_from: the source of the gains, one of `held_out_exposure.SOURCES`.
     """
@@ -106,32 +105,23 @@ def as_exposed(rgb: np.ndarray, log_gains: tuple[float, ...]) -> np.ndarray:
     return exposed(torch.from_numpy(rgb), torch.tensor(log_gains)).clamp(0.0, 1.0).numpy()
 
 
-def held_out_photos(
-    frames: Sequence[Frame], model: Model, *, downscale: int, masks: str, threads: int
-) -> list[HeldOutPhoto]:
-    """Load photos as for training, each with its gains relative to the model, from EXIF or from its neighbours.
+def held_out_photos(run: Run, frames: Sequence[Frame], *, threads: int) -> list[HeldOutPhoto]:
+    """Load held-out photos of a run as for its training, each with its gains, from EXIF or from its neighbours.
 
     Args:
         frames: with their images and masks.
-        model: the model that they are compared with.
-        downscale: the factor of the training.
-        masks: the meaning of black in masks, see `Components`.
 
     Raises:
         UserError: a photo cannot be read.
     """
-    photos = load_photos(frames, factor=downscale, threads=threads, masks=masks)
-    exposed = zip(photos, log_gains_of(frames, model).tolist(), gain_sources(frames, model), strict=True)
+    photos = load_photos(frames, factor=run.config.downscale, threads=threads, masks=run.components.masks)
+    exposed = zip(
+        photos, log_gains_of(frames, run.exposures).tolist(), gain_sources(frames, run.exposures), strict=True
+    )
     return [
         HeldOutPhoto(photo.frame, photo.pixels, photo.used, log_gains=tuple(gains), gains_from=source)
         for photo, gains, source in exposed
     ]
-
-
-def held_out_photos_of(config: RunConfig, frames: Sequence[Frame], model: Model, *, threads: int) -> list[HeldOutPhoto]:
-    """Load held-out photos of a run; see `held_out_photos`."""
-    masks = config.components.masks
-    return held_out_photos(frames, model, downscale=config.downscale, masks=masks, threads=threads)
 
 
 def training_billboards(run: Run, *, notify: Callable[[str], None]) -> Billboards | None:

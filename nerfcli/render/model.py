@@ -52,10 +52,6 @@ def save_model(path: Path, model: Model) -> None:
         "training_from_scene": model.training_from_scene.to_json(),
         "unit": model.unit,
         "unit_source": model.unit_source,
-        "log_exposure": model.log_exposure,
-        "exif_slope": model.exif_slope,
-        "exposures": {name: list(gains) for name, gains in model.exposures.items()},
-        "beyond_exif": {name: list(gains) for name, gains in model.beyond_exif.items()},
     }
     save_tensors(path, tensors, description)
 
@@ -92,10 +88,6 @@ def load_model(path: Path, device: str) -> Model:
         training_from_scene=Similarity.from_json(description["training_from_scene"]),
         unit=description["unit"],
         unit_source=description.get("unit_source"),
-        log_exposure=description.get("log_exposure"),
-        exif_slope=description.get("exif_slope", 1.0),
-        exposures={name: tuple(gains) for name, gains in description.get("exposures", {}).items()},
-        beyond_exif={name: tuple(gains) for name, gains in description.get("beyond_exif", {}).items()},
         sha256=hashlib.sha256(content).hexdigest(),
         fine=fine,
     )

@@ -1,8 +1,6 @@
 """A trained field as rays see it: its frame, its empty space, its background, the steps along rays."""
 
-import dataclasses
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -72,12 +70,6 @@ class TrainedField:
         training_from_scene: normalisation of the scene to the training frame.
         unit: unit of length of the scene's frame, "arbitrary" or "metre".
         unit_source: how the metre is known; None where unknown.
-        log_exposure: mean log exposure of the training photos by EXIF, if the model has gains of photos; see
-            `photos.exif`.
-        exif_slope: factor by which gains follow the exposures in EXIF, see `held_out_exposure.exif_slope`.
-        exposures: log gains (3,) of held-out photos by name, estimated from the training photos where EXIF does not
-            give them; see `render.held_out_exposure`.
-        beyond_exif: offsets (3,) to the gains that EXIF predicts, of held-out photos by name.
         sha256: SHA-256 of the file that the model was read from.
     """
 
@@ -88,10 +80,6 @@ class TrainedField:
     training_from_scene: Similarity
     unit: str
     unit_source: str | None = None
-    log_exposure: float | None = None
-    exif_slope: float = 1.0
-    exposures: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
-    beyond_exif: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
     sha256: str | None = None
     fine: Tensor | None = None
 

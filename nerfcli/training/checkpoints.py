@@ -1,7 +1,7 @@
 """What a training writes while it runs: checkpoints, from which it resumes bit for bit, and waypoints.
 
-Waypoints are copies of the field, measured on held-out pixels once the training is over. No held-out photo is opened
-before, so training can neither learn from them nor be stopped or steered by them.
+Waypoints are copies of field and cameras, measured on held-out pixels once the training is over. No held-out photo is
+opened before, so training can neither learn from them nor be stopped or steered by them.
 """
 
 import shutil
@@ -20,7 +20,7 @@ from nerfcli.atomic import cannot_write
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.run_cameras import write_cameras
+from nerfcli.captures.formats.run_cameras import CAMERAS, write_cameras
 from nerfcli.errors import UserError
 from nerfcli.field.background import colours_behind
 from nerfcli.field.checkpoint import load_tensors, refuse_non_finite, save_tensors
@@ -29,9 +29,15 @@ from nerfcli.field.hash_field import HashField
 from nerfcli.field.kinds import settings_from_json
 from nerfcli.photos.colours import psnr_of
 from nerfcli.photos.exif import log_exposures
+from nerfcli.photos.held_out_exposure import (
+    PhotoExposures,
+    exif_slope,
+    gains_between,
+    gains_beyond_exif,
+    log_gains_of,
+)
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.render.held_out_exposure import exif_slope, gains_between, gains_beyond_exif, log_gains_of
-from nerfcli.render.model import Model, load_model, save_model
+from nerfcli.render.model import Model, save_model
 from nerfcli.render.tracing import render_rays
 from nerfcli.training.appearance import over_background
 from nerfcli.training.extent import Extent
@@ -40,7 +46,7 @@ from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.pool import PixelPool, load_album
 from nerfcli.training.preparation import EarlierDecisions
 from nerfcli.training.runs.files import FIELD, STATE, add_to_log
-from nerfcli.training.runs.run import read_config
+from nerfcli.training.runs.run import Run, read_config
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.sentinel import that_must_be_finite
 from nerfcli.training.storage import IN_MEMORY, PhotoStorage
@@ -90,29 +96,28 @@ class Checkpoints:
             inputs.extent.training_from_scene,
             self._scene.unit,
             self._scene.unit_source,
-            log_exposure=inputs.log_exposure,
-            **self._held_out_exposures(),
         )
 
-    def _held_out_exposures(self) -> dict[str, Any]:
-        """Return the exposures of held-out photos for `Model`, from training photos; none with exposure=exif."""
+    def exposures(self) -> PhotoExposures:
+        """Return the exposures of held-out photos, from the current ones of the training photos."""
         exposure, test = self._fitting.appearance.exposure, self._scene.test_frames
+        mean = self._inputs.log_exposure
         if exposure is None or self._fitting.components.exposure == "exif":
-            return {}
+            return PhotoExposures(mean)
         place = {frame.name: index for index, frame in enumerate(self._scene.frames)}
         places = np.array([place[frame.name] for frame in self._scene.train_frames], dtype=int)
         wanted = np.array([place[frame.name] for frame in test], dtype=int)
         log_gains = exposure.log_gains().detach().cpu().double().numpy()
-        found = {"exposures": gains_between(places, log_gains, wanted)}
-        slope = 1.0
-        if self._inputs.log_exposure is not None:
-            slope = exif_slope(places, log_gains, self._exif)
-            found["beyond_exif"] = gains_beyond_exif(places, log_gains, self._exif, wanted, slope=slope)
-        by_name = {
-            kind: {frame.name: tuple(row) for frame, row in zip(test, gains.tolist(), strict=True)}
-            for kind, gains in found.items()
-        }
-        return {"exif_slope": slope, **by_name}
+
+        def by_name(gains: np.ndarray) -> dict[str, list[float]]:
+            return {frame.name: row for frame, row in zip(test, gains.tolist(), strict=True)}
+
+        around = by_name(gains_between(places, log_gains, wanted))
+        if mean is None:
+            return PhotoExposures(exposures=around)
+        slope = exif_slope(places, log_gains, self._exif)
+        beyond = gains_beyond_exif(places, log_gains, self._exif, wanted, slope=slope)
+        return PhotoExposures(mean, slope, around, by_name(beyond))
 
     @cached_property
     def _exif(self) -> np.ndarray:
@@ -127,13 +132,30 @@ class Checkpoints:
         return refinement.frames(*given, scale=self._inputs.extent.training_from_scene.scale)
 
     def write_cameras(self) -> None:
-        """Write RUN/cameras.json."""
+        """Write RUN/cameras.json, with the exposures of held-out photos."""
+        self._write_cameras(self._run)
+
+    def keep_waypoint(self) -> None:
+        """Keep the current field, cameras and exposures until the training is over, see `measure_waypoints`.
+
+        Raises:
+            UserError: they cannot be written.
+        """
+        waypoint = _waypoint(self._run, self._fitting.step)
+        try:
+            waypoint.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise cannot_write(waypoint, error) from error
+        save_model(waypoint / FIELD, self.model())
+        self._write_cameras(waypoint)
+
+    def _write_cameras(self, folder: Path) -> None:
         refined = self._fitting.appearance.cameras is not None
         given = {frame.name: frame for frame in self._scene.frames} if refined else None
-        write_cameras(self._run, *self.frames(), given=given)
+        write_cameras(folder, *self.frames(), given=given, exposures=self.exposures())
 
     def write(self) -> None:
-        """Write RUN/field.safetensors and RUN/state.safetensors, and the cameras that the field was trained with.
+        """Write RUN/field.safetensors and RUN/state.safetensors, and the cameras and exposures that belong to them.
 
         Of several processes that train together, the first one does.
         """
@@ -159,8 +181,7 @@ class Checkpoints:
 
     def _write_field(self, model: Model) -> None:
         save_model(self._run / FIELD, model)
-        if self._fitting.appearance.cameras is not None:
-            self.write_cameras()
+        self.write_cameras()
 
 
 def read_checkpoint(
@@ -210,24 +231,11 @@ WAYPOINTS_FOLDER = "waypoints"
 WAYPOINT_PIXELS = 4096
 
 
-def keep_waypoint(run: Path, step: int, model: Model) -> None:
-    """Write the field after a step.
-
-    Raises:
-        UserError: it cannot be written.
-    """
-    try:
-        (run / WAYPOINTS_FOLDER).mkdir(exist_ok=True)
-    except OSError as error:
-        raise cannot_write(run / WAYPOINTS_FOLDER, error) from error
-    save_model(_waypoint_path(run, step), model)
-
-
 def forget_waypoints(run: Path, *, after: int = -1) -> None:
     """Remove waypoints of steps later than `after`: a killed training has come farther than its last checkpoint."""
     for step in _waypoints_of(run):
         if step > after:
-            _waypoint_path(run, step).unlink(missing_ok=True)
+            shutil.rmtree(_waypoint(run, step), ignore_errors=True)
     if not _waypoints_of(run):
         shutil.rmtree(run / WAYPOINTS_FOLDER, ignore_errors=True)
 
@@ -259,8 +267,8 @@ def measure_waypoints(
             return
         measured = {}
         for step in steps:
-            model = load_model(_waypoint_path(run, step), device)
-            measured[step] = pixels.psnr(model, log_gains=log_gains_of(held_out, model))
+            waypoint = Run(_waypoint(run, step))
+            measured[step] = pixels.psnr(waypoint.model(device), log_gains=log_gains_of(held_out, waypoint.exposures))
         add_to_log(run, {step: {"heldout_psnr": psnr} for step, psnr in measured.items()})
         curve = ", ".join(f"{psnr:.2f} dB at step {step}" for step, psnr in measured.items())
         notify(f"PSNR on a sample of held-out pixels: {curve}")
@@ -295,7 +303,7 @@ class HeldoutPixels:
         """Return the PSNR in dB over all these pixels, clipped to [0, 1], on the model's background.
 
         Args:
-            log_gains: (photos, 3) of the photos relative to the model's pictures; see `held_out_exposure`.
+            log_gains: (photos, 3) of the photos relative to rendered pictures; see `held_out_exposure`.
         """
         background = colours_behind(model.background, self.directions)
         # All rays at once would take half a gigabyte while space is still full of fog.
@@ -315,8 +323,9 @@ class HeldoutPixels:
 
 def _waypoints_of(run: Path) -> list[int]:
     """Return the steps that have waypoints, in order."""
-    return sorted(int(path.stem) for path in (run / WAYPOINTS_FOLDER).glob("*.safetensors") if path.stem.isdecimal())
+    complete = (run / WAYPOINTS_FOLDER).glob(f"*/{CAMERAS}")  # written after the field
+    return sorted(int(path.parent.name) for path in complete if path.parent.name.isdecimal())
 
 
-def _waypoint_path(run: Path, step: int) -> Path:
-    return run / WAYPOINTS_FOLDER / f"{step}.safetensors"
+def _waypoint(run: Path, step: int) -> Path:
+    return run / WAYPOINTS_FOLDER / str(step)

@@ -21,8 +21,8 @@ from nerfcli.matching.sky import points_before, sky_masks
 from nerfcli.matching.stereo import LEAST_SIDE_PX, DenseDepth, affordable_side_px, dense_depths
 from nerfcli.matching.tracks import Tracks, indices_by_value, triangulate, world_rays
 from nerfcli.photos.exif import log_exposures
+from nerfcli.photos.held_out_exposure import exif_slope
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.render.held_out_exposure import exif_slope
 from nerfcli.training.extent import Extent
 from nerfcli.training.pool import Album, PixelPool, PointDepths
 from nerfcli.training.runs.components import Components

@@ -20,7 +20,6 @@ from nerfcli.training.checkpoints import (
     Checkpoints,
     Totals,
     forget_waypoints,
-    keep_waypoint,
     measure_waypoints,
     read_checkpoint,
     restore,
@@ -239,7 +238,7 @@ def _run(
                 now = progress()
             if waypoints and now >= waypoints[0]:
                 waypoints = [later for later in waypoints if later > now]
-                keep_waypoint(run, fitting.step, checkpoints.model())
+                checkpoints.keep_waypoint()
                 log()
             elif totals.seconds - logged_seconds >= 1.0:
                 log()

@@ -13,9 +13,9 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import centres_of
 from nerfcli.pages.page import data_uri, jpeg_bytes
+from nerfcli.photos.held_out_exposure import PhotoExposures, log_gains_of
 from nerfcli.photos.loading import load_photo, pinhole_of, undistorted
 from nerfcli.render.depth import DepthRequest
-from nerfcli.render.held_out_exposure import log_gains_of
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
 
@@ -43,7 +43,7 @@ class PagePhotos:
 
 
 def page_photos(
-    model: Model,
+    exposures: PhotoExposures,
     train: Sequence[Frame],
     test: Sequence[Frame],
     *,
@@ -53,7 +53,7 @@ def page_photos(
     """Return the photos of a run, undistorted to pinhole cameras, sorted by name.
 
     Args:
-        model: the trained model, for the exposures of the photos.
+        exposures: what is known of the exposures of the photos.
         room_bytes: budget for all pictures, as text in the page.
     """
     frames = _sorted(train, test)
@@ -67,17 +67,17 @@ def page_photos(
         for count, (index, jpeg) in enumerate(zip(of, encoded, strict=True)):
             pictures[index] = data_uri(jpeg, "jpeg")
             on_progress((count + 1) / len(of))
-    entries = [{**entry, "picture": pictures.get(index)} for index, entry in enumerate(_entries(model, frames))]
+    entries = [{**entry, "picture": pictures.get(index)} for index, entry in enumerate(_entries(exposures, frames))]
     return PagePhotos(entries, len(frames) - len(there))
 
 
-def fetched_photos(model: Model, train: Sequence[Frame], test: Sequence[Frame]) -> list[dict[str, Any]]:
+def fetched_photos(exposures: PhotoExposures, train: Sequence[Frame], test: Sequence[Frame]) -> list[dict[str, Any]]:
     """Return the entries of `page_photos` with server addresses of the pictures, which `photo_jpeg` answers."""
     frames = _sorted(train, test)
     there = [frame.image is not None and frame.image.exists() for frame, _ in frames]
     return [
         {**entry, "picture": f"photo?n={index}" if there[index] else None}
-        for index, entry in enumerate(_entries(model, frames))
+        for index, entry in enumerate(_entries(exposures, frames))
     ]
 
 
@@ -118,9 +118,9 @@ def _sorted(train: Sequence[Frame], test: Sequence[Frame]) -> list[tuple[Frame, 
     return sorted(frames, key=lambda entry: entry[0].name)
 
 
-def _entries(model: Model, frames: Sequence[tuple[Frame, str]]) -> list[dict[str, Any]]:
+def _entries(exposures: PhotoExposures, frames: Sequence[tuple[Frame, str]]) -> list[dict[str, Any]]:
     """Return the page entry of each frame, without its picture."""
-    gains = log_gains_of([frame for frame, _ in frames], model)
+    gains = log_gains_of([frame for frame, _ in frames], exposures)
     return [
         {
             "name": frame.name,

@@ -22,7 +22,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import find_model, parse_colmap
 from nerfcli.captures.loading import load_scene
 from nerfcli.errors import UserError
-from nerfcli.evaluate.photos import held_out_photos_of
+from nerfcli.evaluate.photos import held_out_photos
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.machine import default_memory_limit
 from nerfcli.notices import Reporter
@@ -125,7 +125,7 @@ def _capture(scene: Capture) -> CaptureTraits:
 def _measured(run: Run, name: str, settings: TrainSettings) -> MeasuredTraining:
     """Return a training measured on random pixels of the held-out photos, the same for all variants of a seed."""
     model, last = run.model(settings.device), run.log[-1]
-    photos = held_out_photos_of(run.config, run.cameras.test, model, threads=settings.threads)
+    photos = held_out_photos(run, run.cameras.test, threads=settings.threads)
     sample = SampledPixels.drawn(photos, seed=settings.seed)
     return MeasuredTraining(
         name, settings.seed, sample.psnr(model), last["seconds"], last["step"], f"{sample.protocol()}{_SAME}"

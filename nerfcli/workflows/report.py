@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nerfcli.errors import UserError
-from nerfcli.evaluate.photos import held_out_photos_of
+from nerfcli.evaluate.photos import held_out_photos
 from nerfcli.evaluate.report.page import mark_of, origin_of, page_html
 from nerfcli.evaluate.report.run_facts import captures_of, labels_of, read_facts
 from nerfcli.evaluate.report.views import common_names, look_at
@@ -73,7 +73,7 @@ def report_runs(
                 "run the command again when the training is complete",
             )
         frames = [frame for frame in run.cameras.test if frame.name in names[index]]
-        held_out = held_out_photos_of(run.config, frames, model, threads=cores)
+        held_out = held_out_photos(run, frames, threads=cores)
         compared = [photo for photo in held_out if photo.used is None or photo.used.any()]
         photos = photo_depths(run, model, on_progress=lambda fraction: None, notify=reporter.note)
         looks.append(look_at(model, compared, depth=depth, photo_depths=photos, on_progress=on_progress))

@@ -98,9 +98,8 @@ class RunData:
 
     def page(self) -> str:
         version, model = self.model()
-        cameras = Run(self._path).cameras
-        frames = self._frames()
-        photos = fetched_photos(model, cameras.train, cameras.test)
+        run, frames = Run(self._path), self._frames()
+        photos = fetched_photos(run.exposures, run.cameras.train, run.cameras.test)
         scene = scene_of(model, run=self._path, frames=frames, photos=photos, box=_box(model, frames))
         return live_page_html(scene, version=version, refusal=_refusal(model), far=model.marching.far)
 

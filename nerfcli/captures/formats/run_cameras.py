@@ -1,8 +1,8 @@
-"""RUN/cameras.json: the cameras that a field was trained with, refined where training refined them."""
+"""RUN/cameras.json: cameras that a field was trained with, refined where training did so, and exposures of photos."""
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,24 +14,35 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.format import Format
 from nerfcli.errors import UserError
+from nerfcli.photos.held_out_exposure import PhotoExposures
 
 CAMERAS = "cameras.json"
 # Hint for a damaged file of a run.
 REPAIR_HINT = f"train again with --overwrite, or restore the file; if you edited it yourself, remove its entry {SEAL}"
-# Keys: in an entry, camera and pose as the scene had them; beside the entries, the run's absolute path.
-_GIVEN, _WRITTEN_AT = "given", "written_at"
+# Keys: in an entry, camera and pose as the scene had them; beside the entries, exposures, and the run's absolute path.
+_GIVEN, _EXPOSURES, _WRITTEN_AT = "given", "exposures", "written_at"
 
 
 @dataclass(frozen=True)
 class RunCameras:
-    """The frames that were trained on, and those that were held out."""
+    """The frames that were trained on, those that were held out, and what is known of their exposures.
+
+    Args:
+        exposures: None in files of earlier versions, which kept them in the file of the field.
+    """
 
     train: tuple[Frame, ...]
     test: tuple[Frame, ...]
+    exposures: PhotoExposures | None = None
 
 
 def write_cameras(
-    run: Path, train: Sequence[Frame], test: Sequence[Frame], *, given: Mapping[str, Frame] | None = None
+    run: Path,
+    train: Sequence[Frame],
+    test: Sequence[Frame],
+    *,
+    given: Mapping[str, Frame] | None = None,
+    exposures: PhotoExposures = PhotoExposures(),
 ) -> None:
     """Write the frames of both sets: full-size cameras and poses in the scene's frame.
 
@@ -40,10 +51,11 @@ def write_cameras(
     Args:
         train, test: frames as the field knows them.
         given: by name, the frames that training refined, as the scene has them.
+        exposures: as the field knows them.
     """
     frames = {"train": train, "test": test}
     content = {name: [_frame_to_json(frame, run, given or {}) for frame in frames[name]] for name in frames}
-    write_sealed(run / CAMERAS, {**content, _WRITTEN_AT: os.path.abspath(run)})
+    write_sealed(run / CAMERAS, {**content, _EXPOSURES: asdict(exposures), _WRITTEN_AT: os.path.abspath(run)})
 
 
 def read_cameras(run: Path) -> RunCameras:
@@ -94,13 +106,14 @@ def _read_frames(path: Path, *, given: bool) -> RunCameras:
             )
             for name in ("train", "test")
         )
+        exposures = PhotoExposures.from_json(content[_EXPOSURES]) if _EXPOSURES in content else None
     except FileNotFoundError as error:
         raise UserError(
             f"{run} is not a run folder: it has no {CAMERAS}", "give a run folder written by nerfcli train"
         ) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} cannot be read: {error}", REPAIR_HINT) from error
-    return RunCameras(train, test)
+    return RunCameras(train, test, exposures)
 
 
 def _frame_to_json(frame: Frame, run: Path, given: Mapping[str, Frame]) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from nerfcli.captures.loading import fingerprint
 from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.errors import UserError, in_shell
 from nerfcli.field.checkpoint import load_tensors
+from nerfcli.photos.held_out_exposure import PhotoExposures
 from nerfcli.render.model import Model, load_model
 from nerfcli.training.runs.components import Components, Decision, Selection
 from nerfcli.training.runs.files import CONFIG, FIELD, METRICS, STATE, LogEntry, TrainingSummary, read_log
@@ -207,6 +208,11 @@ class Run:
     def given_cameras(self) -> RunCameras:
         """The same frames as the scene had them, before training refined their cameras."""
         return read_given_cameras(self.path)
+
+    @cached_property
+    def exposures(self) -> PhotoExposures:
+        """What is known of the exposures of held-out photos; earlier versions kept it in the file of the field."""
+        return self.cameras.exposures or PhotoExposures.from_json(load_tensors(self.field_path, "cpu")[1])
 
     @cached_property
     def log(self) -> list[LogEntry]:

@@ -1,16 +1,40 @@
 """Exposures of held-out photos, without using their pixels: from EXIF, from photos taken before and after, or both."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Self
 
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.photos.exif import log_exposures
-from nerfcli.render.model import Model
 
 # Sources of a held-out photo's gains: none, as the model has no exposures; EXIF; EXIF and an offset interpolated from
 # the training photos taken before and after; those training photos alone; the mean of all training photos.
 SOURCES = ("none", "EXIF", "EXIF and training photos around", "training photos around", "their mean")
+
+
+@dataclass(frozen=True)
+class PhotoExposures:
+    """What training found out about the exposures of photos that it does not use.
+
+    Args:
+        log_exposure: mean log exposure of the training photos by EXIF; None if unknown or not used.
+        exif_slope: factor by which gains follow the exposures in EXIF, see `exif_slope`.
+        exposures: log gains (3,) of held-out photos by name, for those whose EXIF does not give them; see
+            `gains_between`.
+        beyond_exif: offsets (3,) to the gains that EXIF predicts, by name; see `gains_beyond_exif`.
+    """
+
+    log_exposure: float | None = None
+    exif_slope: float = 1.0
+    exposures: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    beyond_exif: Mapping[str, Sequence[float]] = field(default_factory=dict)
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> Self:
+        """Read the fields from a JSON object, which may lack some and hold others."""
+        return cls(**{name: content[name] for name in cls.__dataclass_fields__ if name in content})
 
 
 def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray) -> np.ndarray:
@@ -113,37 +137,37 @@ def _left_out(predict: Callable[[np.ndarray], np.ndarray], log_gains: np.ndarray
     return float(sum(np.square(predict(o) - log_gains[~o][0]).sum() for o in others))
 
 
-def log_gains_of(frames: Sequence[Frame], model: Model) -> np.ndarray:
-    """Return the logarithms (N, 3) of the gains of photos relative to the pictures of a model.
+def log_gains_of(frames: Sequence[Frame], known: PhotoExposures) -> np.ndarray:
+    """Return the logarithms (N, 3) of the gains of photos relative to rendered pictures.
 
-    They are from EXIF plus the model's offset; without EXIF, from the training photos around; else 0.
+    They are from EXIF plus the photo's offset; without EXIF, from the training photos around; else 0.
     """
-    by_exif = _by_exif(frames, model)
-    offsets, around = _by_name(frames, model.beyond_exif), _by_name(frames, model.exposures)
+    by_exif = _by_exif(frames, known)
+    offsets, around = _by_name(frames, known.beyond_exif), _by_name(frames, known.exposures)
     return np.where(np.isfinite(by_exif)[:, None], by_exif[:, None] + offsets, around)
 
 
-def gain_sources(frames: Sequence[Frame], model: Model) -> list[str]:
+def gain_sources(frames: Sequence[Frame], known: PhotoExposures) -> list[str]:
     """Return the source of each photo's gains in `log_gains_of`, one of `SOURCES`."""
     none, exif, both, around, mean = SOURCES
-    if model.log_exposure is None and not model.exposures:
+    if known.log_exposure is None and not known.exposures:
         return [none] * len(frames)
-    has_exif = np.isfinite(_by_exif(frames, model))
-    has_offset = _by_name(frames, model.beyond_exif).any(1)
-    has_neighbours = _by_name(frames, model.exposures).any(1)
+    has_exif = np.isfinite(_by_exif(frames, known))
+    has_offset = _by_name(frames, known.beyond_exif).any(1)
+    has_neighbours = _by_name(frames, known.exposures).any(1)
     return np.where(has_exif, np.where(has_offset, both, exif), np.where(has_neighbours, around, mean)).tolist()
 
 
-def _by_name(frames: Sequence[Frame], log_gains: Mapping[str, tuple[float, ...]]) -> np.ndarray:
+def _by_name(frames: Sequence[Frame], log_gains: Mapping[str, Sequence[float]]) -> np.ndarray:
     """Return the log gains (N, 3) of photos, 0 for those without an entry."""
     return np.array([log_gains.get(frame.name, (0.0,) * 3) for frame in frames]).reshape(-1, 3)
 
 
-def _by_exif(frames: Sequence[Frame], model: Model) -> np.ndarray:
+def _by_exif(frames: Sequence[Frame], known: PhotoExposures) -> np.ndarray:
     """Return the log gains that EXIF predicts, (N,), NaN where it predicts none."""
-    if model.log_exposure is None or model.exif_slope == 0.0:
+    if known.log_exposure is None or known.exif_slope == 0.0:
         return np.full(len(frames), np.nan)
-    return model.exif_slope * (log_exposures(frames) - model.log_exposure)
+    return known.exif_slope * (log_exposures(frames) - known.log_exposure)
 
 
 def _interpolated(places: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
