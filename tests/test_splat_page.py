@@ -1,13 +1,11 @@
 """The page of splats: what it holds, and in a browser without a network what is where, in which colour."""
 
-import base64
-import gzip
 import math
-import re
 
 import numpy as np
 import pytest
 from browser import Browser, find_browser
+from page_arithmetic import array
 from PIL import Image
 
 from nerfcli.cameras.rigid import apply, inverse, look_at
@@ -31,7 +29,7 @@ def page(tmp_path):
     path = tmp_path / "a <b>.html"
     write_splat_page(
         *(path, balls()),
-        title="<Balls> & more",
+        run=tmp_path / "<Balls> & more",
         world_from_cam=WORLD_FROM_CAM,
         fov_deg=FOV_DEG,
         background=BACKGROUND,
@@ -43,11 +41,10 @@ def page(tmp_path):
 
 def test_page_holds_splats_viewer_and_licence(page, tmp_path):
     text = page.read_text(encoding="utf-8")
-    assert "<title>&lt;Balls&gt; &amp; more</title>" in text
+    assert "<title>&lt;Balls&gt; &amp; more: nerfcli splats</title>" in text
     assert "SuperSplat Viewer 1.36.2" in text
     assert "Permission is hereby granted, free of charge" in text
-    (found,) = re.findall(r'id="splats">([^<]+)<', text)
-    (tmp_path / "a.ply").write_bytes(gzip.decompress(base64.b64decode(found)))
+    (tmp_path / "a.ply").write_bytes(array(text, "splats", "u1").tobytes())
     means = read_splats(tmp_path / "a.ply", print)[0].means
     np.testing.assert_allclose(means, balls().means, rtol=0, atol=np.exp(-2) / 32)  # of the size of the balls
 

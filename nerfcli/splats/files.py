@@ -1,13 +1,9 @@
 """Files of splats by their suffix, and the page with a viewer and splats inside."""
 
-import base64
 import gzip
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -15,7 +11,7 @@ from numpy.lib.recfunctions import structured_to_unstructured
 
 from nerfcli.errors import UserError, listed, several
 from nerfcli.export.meshes import NOT_STATED
-from nerfcli.pages.page import write_page
+from nerfcli.pages.page import Mark, array_element, asset, data_element, page_html, write_page
 from nerfcli.ply import description_in, ply_bytes, read_ply_header, read_ply_vertices, write_ply
 from nerfcli.splats.gaussians import Gaussians
 from nerfcli.splats.spz import packed, read_spz, unpacked, write_spz
@@ -186,11 +182,20 @@ def _suffix(path: Path) -> str:
     return suffix
 
 
+_FULL_WINDOW = "html,body,main,#stage{height:100%;overflow:hidden}main{max-width:none;padding:0}"
+# The viewer in the page compiles WebAssembly, and makes pictures and workers itself.
+_SOURCES = {
+    "script-src": "'unsafe-inline' 'wasm-unsafe-eval'",
+    "img-src": "data: blob:",
+    "worker-src": "blob:",
+}
+
+
 def write_splat_page(
     path: Path,
     gaussians: Gaussians,
     *,
-    title: str,
+    run: Path,
     world_from_cam: np.ndarray,
     fov_deg: float,
     background: Sequence[float],
@@ -200,7 +205,7 @@ def write_splat_page(
 
     Args:
         gaussians: in a frame whose y points down; the viewer's horizon is level in it.
-        title: plain text.
+        run: the folder; the page shows its name.
         world_from_cam: (4, 4) camera of the first view, in that frame; its roll is not kept.
         fov_deg: vertical field of view of the first view, in degrees.
         background: sRGB in [0, 1].
@@ -209,27 +214,37 @@ def write_splat_page(
     Raises:
         UserError: the file cannot be written.
     """
-    here = Path(__file__).parent
     centre, forward = world_from_cam[:3, 3], world_from_cam[:3, 2]
     target = centre + _distance(gaussians, world_from_cam, fov_deg) * forward
     turned = np.array([-1.0, -1.0, 1.0])  # the viewer turns every file half around z, for y to point up
     first = {"position": (turned * centre).tolist(), "target": (turned * target).tolist(), "fov": float(fov_deg)}
-    level = ", ".join(str(round(255 * value)) for value in background)
     data, note = packed(gaussians)
     shown = ply_bytes(splat_columns(unpacked(data)))
-    text = Template((here / "page.html").read_text(encoding="utf-8")).substitute(
-        licence=(here / "supersplat_viewer.txt").read_text(encoding="utf-8"),
-        title=escape(title),
-        background=f"rgb({level})",
-        style=(here / "supersplat_viewer.css").read_text(encoding="utf-8"),
-        first=json.dumps(first, allow_nan=False),
-        colour=json.dumps([float(value) for value in background], allow_nan=False),
-        viewer=base64.b64encode((here / "supersplat_viewer.js.gz").read_bytes()).decode(),
-        splats=base64.b64encode(gzip.compress(shown, 6, mtime=0)).decode(),
+    level = ",".join(str(round(255 * value)) for value in background)
+    body = (
+        f"<!--\n{_part('supersplat_viewer.txt').decode()}-->",
+        '<div id="stage"></div>',
+        "<noscript>This page draws its splats with JavaScript, which is switched off here.</noscript>",
+        data_element("scene", {"first": first, "background": [float(value) for value in background]}),
+        array_element("viewer", np.frombuffer(gzip.decompress(_part("supersplat_viewer.js.gz")), np.uint8)),
+        array_element("splats", np.frombuffer(shown, np.uint8)),
+    )
+    text = page_html(
+        title=run.resolve().name,
+        mark=Mark("splats", run),
+        style=f"{_FULL_WINDOW}#stage{{background:rgb({level})}}\n{_part('supersplat_viewer.css').decode()}",
+        body="\n".join(body),
+        script=asset("arrays.js") + _part("page.js").decode(),
+        sources=_SOURCES,
     )
     write_page(text, path)
     if note:
         notify(f"{path}: {note}")
+
+
+def _part(name: str) -> bytes:
+    """Read a part of the page from the file of that name beside this one."""
+    return Path(__file__).with_name(name).read_bytes()
 
 
 def _distance(gaussians: Gaussians, world_from_cam: np.ndarray, fov_deg: float) -> float:

@@ -1,8 +1,6 @@
 """The page that renders a field: a self-contained HTML file, or a live page from nerfcli's own server."""
 
-import base64
-import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import starmap
@@ -43,7 +41,7 @@ class PageNumbers:
         """Encode a packed field with its proof and its `seen_cells`."""
         description = {"field": packed.field, "march": packed.march, "proof": proof.description, "seen": len(seen)}
         arrays = {**packed.arrays, "expected": proof.expected, "seen": seen}
-        return cls(description, "\n".join(starmap(array_element, arrays.items())))
+        return cls(description, "\n".join(starmap(page.array_element, arrays.items())))
 
 
 def page_html(scene: dict[str, Any], numbers: PageNumbers) -> str:
@@ -53,7 +51,7 @@ def page_html(scene: dict[str, Any], numbers: PageNumbers) -> str:
         scene: see `scene_of`, with the photos of `pictures.page_photos`.
         numbers: its field, and the proof that the page compares its rendering with.
     """
-    return _html(scene | numbers.description, numbers.elements, connect=False)
+    return _html(scene | numbers.description, numbers.elements, page.FROM_INSIDE)
 
 
 def live_page_html(scene: dict[str, Any], *, version: int, refusal: str | None, far: float) -> str:
@@ -66,7 +64,7 @@ def live_page_html(scene: dict[str, Any], *, version: int, refusal: str | None, 
         far: end of the rays, training frame.
     """
     live = {"live": {"refusal": refusal, "version": version}, "march": {"far": far}}
-    return _html(scene | live, "", connect=True)
+    return _html(scene | live, "", page.FROM_ITS_SERVER)
 
 
 def scene_of(
@@ -102,7 +100,7 @@ def scene_of(
     }
 
 
-def _html(scene: dict[str, Any], numbers: str, *, connect: bool) -> str:
+def _html(scene: dict[str, Any], numbers: str, sources: Mapping[str, str]) -> str:
     """Assemble the HTML page around a scene description."""
     shaders = "".join(
         f'<script type="x-shader/x-fragment" id="{part}">{_text(f"{part}.glsl")}</script>' for part in ("trace", "show")
@@ -111,32 +109,21 @@ def _html(scene: dict[str, Any], numbers: str, *, connect: bool) -> str:
         [
             _text("body.html"),
             shaders,
-            array_element("colours", levels_of("turbo")),
+            page.array_element("colours", levels_of("turbo")),
             numbers,
             page.data_element("scene", scene),
         ]
     )
-    parts = (*SCRIPTS, *(LIVE_SCRIPTS if connect else ()), "main.js")
-    script = "\n".join(_text(part).replace('"use strict";\n', "") for part in parts)
+    parts = (*SCRIPTS, *(LIVE_SCRIPTS if "live" in scene else ()), "main.js")
+    script = "\n".join((page.asset("arrays.js"), *map(_text, parts))).replace('"use strict";\n', "")
     return page.page_html(
         title=scene["run"],
         mark=page.Mark("page", Path(scene["run"])),
         style=_text("page.css"),
         body=body,
         script=f'"use strict";\n{script}',
-        connect=connect,
+        sources=sources,
     )
-
-
-def array_element(name: str, values: np.ndarray) -> str:
-    """Return an element that holds an array, see `bytesOf` in field.js.
-
-    Bytes of equal significance are grouped, which compresses better; then deflate and base64. Level 9 of deflate would
-    take 20 times as long as level 6, for a table 1 % smaller.
-    """
-    significance = np.ascontiguousarray(values).view(np.uint8).reshape(-1, values.itemsize).T
-    text = base64.b64encode(zlib.compress(significance.tobytes(), 6)).decode()
-    return f'<script type="text/plain" id="{name}" data-itemsize="{values.itemsize}">{text}</script>'
 
 
 @cache

@@ -91,7 +91,7 @@ def export_splats(
         write_splat_page(
             path,
             gaussians,
-            title=run.path.resolve().name,
+            run=run.path,
             world_from_cam=file_from_scene.apply_pose(run.cameras.train[0].world_from_cam),
             fov_deg=camera.fov_deg[1],
             background=splats.background,
