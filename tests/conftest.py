@@ -144,9 +144,9 @@ def finished(capture: Path) -> Path:
 
 def write_run(run: Path, captured: Capture, model: Model, *, factor: int) -> None:
     """Write the folder that a training of seven steps at 1 / factor of the resolution leaves, with the given model."""
-    settings = TrainSettings(budget_seconds=None, steps=7)
+    settings = TrainSettings(budget_seconds=None, steps=7, downscale=factor, contraction="none")
     run.mkdir()
-    write_json(run / CONFIG, RunConfig.describing(captured, settings, factor=factor, contraction="none").to_json())
+    write_json(run / CONFIG, replace(RunConfig.describing(captured), settings=settings).to_json())
     write_cameras(run, captured.train_frames, captured.test_frames)
     save_model(run / FIELD, model)
     entry: LogEntry = {

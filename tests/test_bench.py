@@ -37,7 +37,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.errors import BAD_INPUT, INTERRUPTED
 from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels
-from nerfcli.machine import processor_name
+from nerfcli.machine import Resources, processor_name
 from nerfcli.render.model import Model
 from nerfcli.training.extent import object_frame
 from nerfcli.training.runs.settings import TrainSettings
@@ -216,7 +216,7 @@ def test_a_bench_of_a_scene_trains_it(spheres, tmp_path, monkeypatch):
     monkeypatch.setattr(measurement, "affordable", lambda settings, seconds, overhead: (settings[:2], 600.0))
     monkeypatch.setattr(TrainSetting, "settings", lambda self, base, seconds: replace(base, steps=2, downscale=8))
     saved: list[list[Point]] = []
-    how = {"device": "cpu", "threads": 2, "seconds": 60.0}
+    how = {"resources": Resources(2, "cpu"), "seconds": 60.0}
     measurement.measure_trainings(
         spheres.root, tmp_path, **how, save=lambda points: saved.append(list(points)), tell=lambda *progress: None
     )

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from markupsafe import escape
 
 from nerfcli.errors import UserError
+from nerfcli.output import Output
 from nerfcli.pages import page
 
 EVIL = "</script><script>alert(1)</script><b>\u2028&\"'"
@@ -83,10 +84,10 @@ def test_pictures_read_back_by_another_reader():
 
 def test_only_a_page_of_the_same_kind_and_source_is_replaced(tmp_path):
     path, mark = tmp_path / "page.html", page.Mark("test", tmp_path)
-    page.refuse_foreign(path, mark, about="capture")
+    page.claim_page(Output(), path, mark, about="capture")
     page.write_page(simple(tmp_path), path)
-    page.refuse_foreign(path, mark, about="capture")
+    page.claim_page(Output(), path, mark, about="capture")
     assert str(tmp_path) not in path.read_text(encoding="utf-8")
     for other in (page.Mark("bench", tmp_path), page.Mark("test", tmp_path.parent)):
         with pytest.raises(UserError, match="not a page of this capture"):
-            page.refuse_foreign(path, other, about="capture")
+            page.claim_page(Output(), path, other, about="capture")

@@ -27,6 +27,7 @@ from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import compare
 from nerfcli.evaluate.photos import HeldOutPhoto, background_of, held_out_photos, paired
 from nerfcli.evaluate.sampled import SampledPixels
+from nerfcli.machine import Resources
 from nerfcli.photos.images import downscale
 from nerfcli.photos.loading import downscaled_camera
 from nerfcli.render.accuracy import TIGHT
@@ -203,7 +204,7 @@ Save = Callable[[Sequence[Point]], None]
 Tell = Callable[[float, str], None]
 
 
-def measure_renderings(run: Run, *, device: str, threads: int, seconds: float, save: Save, tell: Tell) -> None:
+def measure_renderings(run: Run, *, resources: Resources, seconds: float, save: Save, tell: Tell) -> None:
     """Measure as many rendering settings of a run as time allows.
 
     Raises:
@@ -214,11 +215,12 @@ def measure_renderings(run: Run, *, device: str, threads: int, seconds: float, s
     def spent() -> float:
         return min(1.0, (time.monotonic() - began) / seconds)
 
+    device = resources.torch_device
     model = run.model(device)
-    photos = held_out_photos(run, run.cameras.test, threads=threads)
+    photos = held_out_photos(run, run.cameras.test)
     if not photos:
         raise UserError(f"{run.path} has no held-out photos", "by default every 8th photo is held out; check the split")
-    settings = render_settings(threads)
+    settings = render_settings(resources.cores)
     tell(0.0, "rendering a first picture")
     _render(model, photos[0], settings[0])
     once = _timed(model, photos[:1], settings[0])
@@ -263,7 +265,7 @@ def measure_renderings(run: Run, *, device: str, threads: int, seconds: float, s
 
 
 def measure_trainings(
-    scene_folder: Path, work: Path, *, device: str, threads: int, seconds: float, save: Save, tell: Tell
+    scene_folder: Path, work: Path, *, resources: Resources, seconds: float, save: Save, tell: Tell
 ) -> None:
     """Train a scene with as many settings as time allows, each for the same time unless it is the time that varies.
 
@@ -276,7 +278,8 @@ def measure_trainings(
     scene = load_scene(scene_folder)
     if not scene.test_frames:
         raise UserError(f"{scene_folder} has no held-out photos", "by default every 8th photo is held out")
-    base = TrainSettings(device=device, threads=threads, **sizes_for(device))
+    device = resources.torch_device
+    base = TrainSettings(device=device, threads=resources.cores, **sizes_for(device))
     chosen, unit = affordable(train_settings(), seconds, overhead=6.0)
     points: list[Point] = []
     memory, folder = PeakMemory(device), work / _WORK
@@ -292,7 +295,7 @@ def measure_trainings(
             train(scene, folder, wanted, resume=False, notify=lambda text: None, on_progress=on_progress)
             trained = Run(folder)
             model, summary = trained.model(device), trained.summary
-            photos = held_out_photos(trained, scene.test_frames, threads=threads)
+            photos = held_out_photos(trained, scene.test_frames)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
         assert summary is not None

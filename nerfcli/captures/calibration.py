@@ -129,7 +129,7 @@ def _fits(calibration: Calibration, number: int, picture: Picture) -> bool:
 def _fitted(calibration: Calibration, number: int, picture: Picture) -> Camera:
     orientation = 1 if calibration.upright else picture.orientation
     measured = (picture.width, picture.height, orientation)
-    camera, _ = fit_to_picture(calibration.cameras[number], np.eye(4), path=picture.path, measure=lambda path: measured)
+    camera, _ = fit_to_picture(calibration.cameras[number], np.eye(4), path=picture.path, measured=measured)
     return camera
 
 

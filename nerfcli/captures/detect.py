@@ -114,7 +114,10 @@ def detect(capture: Capture, *, axes: str, progress: Callable[[float, str], None
         ("pixel centre", [replace(best, pixel_centre=centre) for centre in (0.5, 0.0)]),
     ]
     for name, variants in further if evidence.shows_intrinsics else ():
-        tried = [(variant, _errors(evidence, poses, variant, axes)) for variant in variants]
+        tried = []
+        for variant in variants:
+            in_opencv = reinterpreted_poses(poses, variant, parsed_axes=axes)
+            tried.append((variant, evidence.errors_px(evidence.directions(variant), in_opencv)))
         question = _question(name, tried, declared, evidence)
         questions.append(question)
         if question.verdict == "holds":
@@ -161,12 +164,6 @@ def _axes_and_scale(
     best, _ = min(tried, key=lambda pair: _rank(pair[1], evidence.threshold_px))
     at_its_scale = [pair for pair in tried if pair[0].intrinsics_scale == best.intrinsics_scale]
     return best, _question("axes and direction", at_its_scale, declared, evidence)
-
-
-def _errors(evidence: Evidence, poses: np.ndarray, convention: Convention, parsed_axes: str) -> np.ndarray:
-    return evidence.errors_px(
-        evidence.directions(convention), reinterpreted_poses(poses, convention, parsed_axes=parsed_axes)
-    )
 
 
 def _rank(errors: np.ndarray, threshold_px: float) -> tuple[float, float]:

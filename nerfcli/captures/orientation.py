@@ -20,7 +20,8 @@ from nerfcli.photos.exif import read_exif
 from nerfcli.photos.images import image_size
 
 # Returns an image file's width and height, EXIF orientation applied, and that orientation (1 if none).
-Measure = Callable[[Path], tuple[int, int, int]]
+Measured = tuple[int, int, int]
+Measure = Callable[[Path], Measured]
 
 # Rotations upright_from_stored of the picture, in (x right, y down): EXIF 3 is half a turn, 6 a quarter clockwise,
 # 8 a quarter counter-clockwise. Source: Exif 2.32, tag 0x0112.
@@ -48,7 +49,7 @@ def stored_size(path: Path) -> Size:
 
 
 def fit_to_picture(
-    camera: Camera, world_from_cam: np.ndarray, *, path: Path, measure: Measure
+    camera: Camera, world_from_cam: np.ndarray, *, path: Path, measured: Measured
 ) -> tuple[Camera, np.ndarray]:
     """Return the camera and pose for the upright picture on disk.
 
@@ -58,7 +59,7 @@ def fit_to_picture(
     Raises:
         UserError: neither aspect ratio fits (both sizes are named), or the EXIF orientation mirrors the picture.
     """
-    orientation, size = turn_to_upright(camera, path=path, measure=measure)
+    orientation, size = turn_to_upright(camera, measured, path=path)
     try:
         resized = camera.resized(*size)
     except UserError as error:
@@ -66,7 +67,7 @@ def fit_to_picture(
     return turned(resized, world_from_cam, orientation=orientation)
 
 
-def turn_to_upright(camera: Camera, *, path: Path, measure: Measure) -> tuple[int, tuple[int, int]]:
+def turn_to_upright(camera: Camera, measured: Measured, *, path: Path) -> tuple[int, Size]:
     """Return the EXIF orientation that turns a camera's picture upright, and the size of the picture on disk.
 
     The orientation is 1 if the camera is for the upright picture already. The size is of the picture as the camera
@@ -75,7 +76,7 @@ def turn_to_upright(camera: Camera, *, path: Path, measure: Measure) -> tuple[in
     Raises:
         UserError: the EXIF orientation mirrors the picture.
     """
-    width, height, orientation = measure(path)
+    width, height, orientation = measured
     if orientation not in _TURNS:
         raise UserError(
             f"{path}: EXIF orientation {orientation} mirrors the photo, which is not supported",
@@ -227,7 +228,7 @@ def in_pixels(capture: Capture, pixels: str) -> ReorientedCapture:
 def upright(frame: Frame, measure: Measure) -> Frame:
     """Return a frame fitted to its upright photo on disk; its camera may be for another size or the stored pixels."""
     assert frame.image is not None
-    camera, pose = fit_to_picture(frame.camera, frame.world_from_cam, path=frame.image, measure=measure)
+    camera, pose = fit_to_picture(frame.camera, frame.world_from_cam, path=frame.image, measured=measure(frame.image))
     return replace(frame, camera=camera, world_from_cam=pose)
 
 
@@ -264,8 +265,8 @@ def _turned_observations(capture: Capture, turns: np.ndarray) -> Observations | 
 def _turn(frame: Frame, pixels: str) -> int:
     """Return the EXIF orientation that turns the pixels of a frame's camera into the requested ones."""
     assert frame.image is not None
-    width, height, written = measure(frame.image)
-    orientation, size = turn_to_upright(frame.camera, path=frame.image, measure=lambda _: (width, height, written))
+    measured = width, height, written = measure(frame.image)
+    orientation, size = turn_to_upright(frame.camera, measured, path=frame.image)
     if pixels == STORED:
         orientation, size = turn_back(written), (width, height)
     try:

@@ -83,10 +83,10 @@ def bench_one(path: Path, output: Output, seconds: float, *, resources: Resource
             return content
     if is_busy(load := load_average()):
         console.warn(f"other programs use the processors (load average {load:.1f}): times will be too long and vary")
-    device, threads = resources.torch_device, resources.cores
-    kernels.prepare(console.note, device)
-    about = {"source": str(path), "machine": describe_machine(device, threads), "load_average": load}
-    how = {"device": device, "threads": threads, "seconds": seconds}
+    kernels.prepare(console.note, resources.torch_device)
+    machine = describe_machine(resources.torch_device, resources.cores)
+    about = {"source": str(path), "machine": machine, "load_average": load}
+    how = {"resources": resources, "seconds": seconds}
     latest: list[Point] = []
 
     def save(points: Sequence["Point"]) -> None:

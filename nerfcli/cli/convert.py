@@ -233,7 +233,7 @@ def convert(
     if detect:
         if written.to is not None or target is not None:
             raise typer.BadParameter("--detect writes nothing; remove OUT and --to")
-        for_each_input(source, lambda given: _detect(given.path, read, overrides, console), command="convert")
+        for_each_input(source, lambda given: _detect(given.path, read, console), command="convert")
         return
     wanted, frame = written.target(), world.frame()
     if target is None:
@@ -257,11 +257,11 @@ def convert(
     for_each_input(source, work, command="convert")
 
 
-def _detect(path: Path, read: SourceOptions, overrides: "ConventionOverrides", console: Console) -> None:
+def _detect(path: Path, read: SourceOptions, console: Console) -> None:
     from nerfcli.workflows.convert import detect_convention, detection_record
 
     with console.stage(f"detect {path.name}") as reporter:
-        form, found = detect_convention(path, given=read.given(), overrides=overrides, reporter=reporter)
+        form, found = detect_convention(path, given=read.given(), overrides=read.overrides(), reporter=reporter)
     lines = [f"{path} ({form.name}), judged by {found.evidence}", *_table(found)]
     console.facts(path, detection_record(found, form.name), "\n".join(lines))
 

@@ -1,12 +1,10 @@
 """nerfcli selftest: check numerical accuracy on this machine."""
 
 import time
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
-from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Device, Quiet
+from nerfcli.cli.console import command
+from nerfcli.cli.options import Device, Printing
 from nerfcli.errors import GATE_NOT_MET, UserError
 from nerfcli.machine import Resources
 
@@ -32,10 +30,8 @@ _STYLES = {"met": "green", "not met": "bold red"}
 @command
 def selftest(
     device: Device = "auto",
-    json: Annotated[
-        bool, typer.Option("--json", help="Print one line of JSON per row on stdout instead of the table.")
-    ] = False,
-    quiet: Quiet = False,
+    *,
+    printing: Printing,
 ) -> None:
     """Check the numerical accuracy of the kernels on hard cases.
 
@@ -53,16 +49,16 @@ def selftest(
     from nerfcli.kernels.selftest.measure import MET, NOT_MET, by_formula
     from nerfcli.kernels.selftest.table import rows
 
-    console = Console(quiet=quiet, json_lines=json)
+    console = printing.console
     resources = Resources(0, device)
     resources.begin()
     begin, measured = time.perf_counter(), []
     for row in rows(resources.torch_device, console.note):
         measured.append(row)
-        if json:
+        if printing.json:
             console.fact(row.to_json())
     formulas = by_formula(measured)
-    if not json:
+    if not printing.json:
         console.fact_table(_COLUMNS, [_cells(row) for row in measured], styles=_STYLES)
     met = sum(row.verdict == MET for row in measured)
     failed = [row for row in measured if row.verdict == NOT_MET]

@@ -40,7 +40,7 @@ def view(
       nerfcli view photos-scene-run --port 9000 --no-browser
     """
     from nerfcli.viewer.server import Address
-    from nerfcli.workflows.view import view_run
+    from nerfcli.workflows.view import open_browser, view_run
 
     console = Console(quiet=False, json_lines=False)
 
@@ -49,5 +49,7 @@ def view(
         if from_elsewhere:
             console.note(f"from another machine: {from_elsewhere}, then the same address there")
         console.note("Ctrl-C ends the server")
+        if browser:
+            open_browser(url)
 
-    view_run(run, Address(host, port), browser=browser, resources=Resources(threads), on_ready=on_ready)
+    view_run(run, Address(host, port), resources=Resources(threads), on_ready=on_ready)

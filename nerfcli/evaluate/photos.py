@@ -105,7 +105,7 @@ def as_exposed(rgb: np.ndarray, log_gains: tuple[float, ...]) -> np.ndarray:
     return exposed(torch.from_numpy(rgb), torch.tensor(log_gains)).clamp(0.0, 1.0).numpy()
 
 
-def held_out_photos(run: Run, frames: Sequence[Frame], *, threads: int) -> list[HeldOutPhoto]:
+def held_out_photos(run: Run, frames: Sequence[Frame]) -> list[HeldOutPhoto]:
     """Load held-out photos of a run as for its training, each with its gains, from EXIF or from its neighbours.
 
     Args:
@@ -114,7 +114,8 @@ def held_out_photos(run: Run, frames: Sequence[Frame], *, threads: int) -> list[
     Raises:
         UserError: a photo cannot be read.
     """
-    photos = load_photos(frames, factor=run.config.downscale, threads=threads, masks=run.components.masks)
+    threads, masks = torch.get_num_threads(), run.components.masks
+    photos = load_photos(frames, factor=run.config.downscale, threads=threads, masks=masks)
     exposed = zip(
         photos, log_gains_of(frames, run.exposures).tolist(), gain_sources(frames, run.exposures), strict=True
     )

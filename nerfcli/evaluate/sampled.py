@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from nerfcli.evaluate.metrics import compare
 from nerfcli.evaluate.photos import HeldOutPhoto, as_exposed, background_of, over_white
@@ -13,7 +12,7 @@ from nerfcli.evaluate.protocol import PROTOCOL
 from nerfcli.field.background import colours_behind
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import Renderable
-from nerfcli.render.tracing import TOLERANCE, pixel_rays, render_rays, uniform_cuts
+from nerfcli.render.tracing import pixel_rays, render_rays
 
 SAMPLED_PIXELS = 2**14
 
@@ -53,10 +52,9 @@ class SampledPixels:
     @torch.no_grad()
     def psnr(self, model: Model) -> float:
         """Return the mean over photos of the PSNR on their pixels, in dB, 8 bit, to estimate the mean of `evaluate`."""
-        cuts = uniform_cuts(model.marching)
         values = []
         for photo, pixels in zip(self.photos, self.pixels, strict=True):
-            rgb, valid = render_sampled(model, photo, pixels, cuts=cuts, tolerance=TOLERANCE)
+            rgb, valid = _render_sampled(model, photo, pixels)
             truth = over_white(photo.pixels).reshape(-1, 3)[pixels]
             if valid.any():
                 values.append(compare(as_exposed(rgb, photo.log_gains), truth, used=valid).psnr)
@@ -74,14 +72,8 @@ class SampledPixels:
         return float(np.mean(values))
 
 
-def render_sampled(
-    model: Model,
-    photo: HeldOutPhoto,
-    pixels: np.ndarray,
-    *,
-    cuts: Tensor,
-    tolerance: float,
-    at_a_time: int = 4096,
+def _render_sampled(
+    model: Model, photo: HeldOutPhoto, pixels: np.ndarray, *, at_a_time: int = 4096
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return colours (N, 3) in [0, 1] at pixel centres, in the field's precision, and which of them have a ray."""
     dtype = next(model.field.parameters()).dtype
@@ -93,9 +85,7 @@ def render_sampled(
             model,
             origin.expand_as(some),
             some,
-            cuts=cuts.to(some),
             background=behind[begin : begin + len(some)],
-            tolerance=tolerance,
             cones=rays.cones[begin : begin + len(some)].to(dtype),
         ).rgb
         for begin, some in zip(range(0, len(directions), at_a_time), directions.split(at_a_time), strict=True)

@@ -152,10 +152,13 @@ def write_page(text: str, path: Path) -> None:
 
 def is_made_from(path: Path, origin: str) -> bool:
     """Return whether the page at a path was made from content with this digest."""
-    if not path.is_file():
-        return False
+    return path.is_file() and _head_has(path, _origin_html(origin))
+
+
+def _head_has(path: Path, html: str) -> bool:
+    """Return whether the head of a page holds a mark or an origin."""
     with path.open("rb") as file:
-        return _origin_html(origin).encode() in file.read(_HEAD_BYTES)
+        return html.encode() in file.read(_HEAD_BYTES)
 
 
 def _origin_html(origin: str) -> str:
@@ -163,37 +166,24 @@ def _origin_html(origin: str) -> str:
 
 
 def claim_page(output: Output, path: Path, mark: Mark, *, about: str) -> None:
-    """Raise unless a page can be written at a path; see `refuse_foreign`, unless anything there may be replaced.
+    """Raise unless a page can be written at a path: nothing is there that may not be replaced.
+
+    Pages with the same mark may always be replaced.
+
+    Args:
+        about: the subject of such a page, for the message: "capture".
 
     Raises:
         UserError: the path is a folder, cannot be written, or holds something else.
     """
     if path.is_dir():
         raise UserError(f"{path} is a folder", "give a file name for the page with -o")
-    if not output.overwrite:
-        refuse_foreign(path, mark, about=about)
+    if path.exists() and not output.overwrite and not _head_has(path, mark.html()):
+        raise UserError(
+            f"{path} exists and is not a page of this {about}",
+            "add --overwrite to replace it, or choose another file with -o",
+        )
     refuse_read_only(path)
-
-
-def refuse_foreign(path: Path, mark: Mark, *, about: str) -> None:
-    """Raise unless a page may be written at a path: it is free, or holds an earlier page with the same mark.
-
-    Args:
-        about: the subject of such a page, for the message: "capture".
-
-    Raises:
-        UserError: something else exists there.
-    """
-    if not path.exists():
-        return
-    if path.is_file():
-        with path.open("rb") as file:
-            if mark.html().encode() in file.read(_HEAD_BYTES):
-                return
-    raise UserError(
-        f"{path} exists and is not a page of this {about}",
-        "add --overwrite to replace it, or choose another file with -o",
-    )
 
 
 @dataclass(frozen=True)

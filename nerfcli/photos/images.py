@@ -353,7 +353,7 @@ class Listing:
 def list_photos(folder: Path, *, subfolders: bool = False) -> Listing:
     """List the photos directly in a folder and, on request, in all of its subfolders."""
     pictures, unreadable, counts = list[Path](), list[Path](), Counter[str]()
-    for each in _folders(folder, subfolders=subfolders):
+    for each in _with_subfolders(folder) if subfolders else [folder]:
         read, unread = list_images(each), _unreadable(each)
         pictures += read
         unreadable += unread
@@ -383,10 +383,8 @@ def where_photos_may_be(folder: Path) -> str:
     return f"{there}expected photos, such as .jpg, .png, .heic, .tif or .webp"
 
 
-def _folders(folder: Path, *, subfolders: bool) -> list[Path]:
-    """Return a folder and, on request, all of its subfolders; not hidden ones, nor links to the others."""
-    if not subfolders:
-        return [folder]
+def _with_subfolders(folder: Path) -> list[Path]:
+    """Return a folder and all of its subfolders; not hidden ones, nor links to the others."""
     below = (path for path in folder.rglob("*") if path.is_dir())
     shown = [path for path in below if "/." not in f"/{name_in(folder, path)}"]
     folders = [folder, *sorted(shown, key=Path.is_symlink)]

@@ -23,17 +23,8 @@ _ROWS = 2**16
 _ELSEWHERE = "open it in SuperSplat (superspl.at/editor) and export it as .ply"
 
 
-def write_splat_ply(path: Path, gaussians: Gaussians, description: Mapping[str, Any] | None = None) -> None:
-    """Write Gaussians, atomically, with their description as comments; quaternions are written with norm 1.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
-    write_ply(path, splat_columns(gaussians), description=description)
-
-
 def splat_columns(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """Return the properties (N,) of a file by name, in the order of files."""
+    """Return the properties (N,) of a file by name, in the order of files; quaternions have norm 1."""
     count, harmonics = len(gaussians), gaussians.harmonics
     norms = np.linalg.norm(gaussians.quaternions.astype(np.float64), axis=1, keepdims=True)
     values = [
@@ -149,7 +140,7 @@ def write_splats(
     if _suffix(path) == ".spz":
         write_spz(path, gaussians, description, notify=notify)
     else:
-        write_splat_ply(path, gaussians, description)
+        write_ply(path, splat_columns(gaussians), description=description)
 
 
 def splat_facts(path: Path) -> dict[str, Any]:

@@ -18,7 +18,6 @@ from torch import Tensor
 from nerfcli import distributed
 from nerfcli.atomic import cannot_write
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.rigid import Similarity
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.run_cameras import CAMERAS, write_cameras
 from nerfcli.errors import UserError
@@ -36,7 +35,6 @@ from nerfcli.photos.held_out_exposure import (
     gains_beyond_exif,
     log_gains_of,
 )
-from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.model import Model, save_model
 from nerfcli.render.tracing import render_rays
 from nerfcli.training.appearance import over_background
@@ -49,7 +47,6 @@ from nerfcli.training.runs.files import FIELD, STATE, add_to_log
 from nerfcli.training.runs.run import Run, read_config
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.sentinel import that_must_be_finite
-from nerfcli.training.storage import IN_MEMORY, PhotoStorage
 
 STATE_FORMAT = "nerfcli training 2"
 # Photos without alpha fill the frame; behind the field is black, and little of it shows through.
@@ -255,13 +252,14 @@ def measure_waypoints(
             album = load_album(
                 held_out, factor=inputs.factor, threads=settings.threads, storage=inputs.storage, masks=masks
             )
-            pixels = HeldoutPixels(
+            pool = PixelPool(
                 album.photos,
                 inputs.extent.training_from_scene,
                 torch.device(device),
                 colours=album.colours,
                 storage=inputs.storage,
             )
+            pixels = HeldoutPixels(pool)
         except UserError as error:
             notify(f"training is complete, but PSNR on held-out photos could not be measured: {error}")
             return
@@ -276,23 +274,10 @@ def measure_waypoints(
 
 
 class HeldoutPixels:
-    """A fixed sample of a few thousand distinct pixels of the held-out photos, or most of them if there are fewer.
+    """A fixed sample of a few thousand distinct pixels of the held-out photos, or most of them if there are fewer."""
 
-    Args:
-        colours, storage: see `PixelPool`.
-    """
-
-    def __init__(
-        self,
-        photos: Sequence[LoadedPhoto],
-        training_from_scene: Similarity,
-        device: torch.device,
-        *,
-        colours: np.ndarray | None = None,
-        storage: PhotoStorage = IN_MEMORY,
-    ):
-        pool = PixelPool(photos, training_from_scene, device, colours=colours, storage=storage)
-        generator = torch.Generator(device=device).manual_seed(1)
+    def __init__(self, pool: PixelPool):
+        generator = torch.Generator(device=pool.colours.device).manual_seed(1)
         numbers = pool.numbers(WAYPOINT_PIXELS, generator).unique()
         self.origins, self.directions, self.colours = pool.rays_of(numbers)[:3]
         self.cones = pool.cones[pool.photo_of(numbers)]

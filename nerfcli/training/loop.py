@@ -132,9 +132,8 @@ def train(
         totals = Totals(seconds=searched, searched=searched)
         _clear(run)
     write_left_out(run, inputs, notify=notify)
-    factor, contraction = inputs.factor, inputs.extent.contraction
-    config = RunConfig.describing(scene, settings, factor=factor, contraction=contraction, selection=inputs.selection)
-    write_config(run, config)
+    chosen = replace(settings, downscale=inputs.factor, contraction=inputs.extent.contraction)
+    write_config(run, replace(RunConfig.describing(scene), settings=chosen, selection=inputs.selection))
     checkpoints = Checkpoints(run, fitting, totals, inputs=inputs, scene=scene)
     checkpoints.write_cameras()
     sentinel = Sentinel(fitting, run=run, notify=notify)

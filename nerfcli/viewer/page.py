@@ -1,6 +1,6 @@
 """The page that renders a field: a self-contained HTML file, or a live page from nerfcli's own server."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import starmap
@@ -51,7 +51,7 @@ def page_html(scene: dict[str, Any], numbers: PageNumbers) -> str:
         scene: see `scene_of`, with the photos of `pictures.page_photos`.
         numbers: its field, and the proof that the page compares its rendering with.
     """
-    return _html(scene | numbers.description, numbers.elements, page.FROM_INSIDE)
+    return _html(scene | numbers.description, numbers.elements)
 
 
 def live_page_html(scene: dict[str, Any], *, version: int, refusal: str | None, far: float) -> str:
@@ -64,7 +64,7 @@ def live_page_html(scene: dict[str, Any], *, version: int, refusal: str | None, 
         far: end of the rays, training frame.
     """
     live = {"live": {"refusal": refusal, "version": version}, "march": {"far": far}}
-    return _html(scene | live, "", page.FROM_ITS_SERVER)
+    return _html(scene | live, "")
 
 
 def scene_of(
@@ -100,7 +100,7 @@ def scene_of(
     }
 
 
-def _html(scene: dict[str, Any], numbers: str, sources: Mapping[str, str]) -> str:
+def _html(scene: dict[str, Any], numbers: str) -> str:
     """Assemble the HTML page around a scene description."""
     shaders = "".join(
         f'<script type="x-shader/x-fragment" id="{part}">{_text(f"{part}.glsl")}</script>' for part in ("trace", "show")
@@ -114,7 +114,8 @@ def _html(scene: dict[str, Any], numbers: str, sources: Mapping[str, str]) -> st
             page.data_element("scene", scene),
         ]
     )
-    parts = (*SCRIPTS, *(LIVE_SCRIPTS if "live" in scene else ()), "main.js")
+    is_live = "live" in scene
+    parts = (*SCRIPTS, *(LIVE_SCRIPTS if is_live else ()), "main.js")
     script = "\n".join((page.asset("arrays.js"), *map(_text, parts))).replace('"use strict";\n', "")
     return page.page_html(
         title=scene["run"],
@@ -122,7 +123,7 @@ def _html(scene: dict[str, Any], numbers: str, sources: Mapping[str, str]) -> st
         style=_text("page.css"),
         body=body,
         script=f'"use strict";\n{script}',
-        sources=sources,
+        sources=page.FROM_ITS_SERVER if is_live else page.FROM_INSIDE,
     )
 
 

@@ -125,7 +125,7 @@ def _capture(scene: Capture) -> CaptureTraits:
 def _measured(run: Run, name: str, settings: TrainSettings) -> MeasuredTraining:
     """Return a training measured on random pixels of the held-out photos, the same for all variants of a seed."""
     model, last = run.model(settings.device), run.log[-1]
-    photos = held_out_photos(run, run.cameras.test, threads=settings.threads)
+    photos = held_out_photos(run, run.cameras.test)
     sample = SampledPixels.drawn(photos, seed=settings.seed)
     return MeasuredTraining(
         name, settings.seed, sample.psnr(model), last["seconds"], last["step"], f"{sample.protocol()}{_SAME}"

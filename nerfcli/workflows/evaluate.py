@@ -87,7 +87,7 @@ def evaluate_run(
         raise UserError(f"{trained.path} has no {LOG}, which records the training time", "train again with --overwrite")
     refuse_read_only(path)
     test = trained.cameras.test
-    held_out = held_out_photos(trained, test, threads=cores)
+    held_out = held_out_photos(trained, test)
     perceptual = find_perceptual(reporter.note)
     billboards = training_billboards(trained, notify=reporter.note)
     reporter.progress(0.0, "")
@@ -137,7 +137,7 @@ def evaluate_splats(
     if (kept := _kept(path, digest, output, reporter)) is not None:
         return kept
     refuse_read_only(path)
-    held_out = held_out_photos(trained, trained.cameras.test, threads=cores)
+    held_out = held_out_photos(trained, trained.cameras.test)
     metrics = evaluate_model(
         scene,
         held_out,

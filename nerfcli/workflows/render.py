@@ -4,6 +4,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from nerfcli.atomic import cannot_write
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.camera_path import losses_camera_path, write_camera_path
+from nerfcli.captures.formats.transforms import write_transforms
 from nerfcli.errors import UserError
 from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
@@ -22,7 +28,6 @@ from nerfcli.workflows.views import (
     frames_of_file,
     refuse_z_depth_for_equirectangular,
     usual_depth,
-    write_frames,
 )
 
 RENDERS = "renders"
@@ -152,13 +157,26 @@ def render_splats(
 def write_cameras(
     run: str | Path, output: Output, views: Views, *, fps: float, reporter: Reporter = Reporter()
 ) -> Path:
-    """Write only the cameras of views of a run, see `write_frames`; return the folder.
+    """Write only the cameras of views of a run into a folder, and return it.
+
+    They are in cameras.json, in transforms format, and in camera_path.json for nerfstudio's viewer.
 
     Raises:
-        UserError: the run or the cameras do not exist, or one of the files exists.
+        UserError: the run or the cameras do not exist, or one of the files exists, or cannot be written.
     """
     trained = Run(Path(run))
     folder = output.at(trained.path / RENDERS / f"{views.name}-cameras")
     frames = chosen_frames(trained, views, depth_hint=1.0 / trained.model().training_from_scene.scale)
-    write_frames(frames, replace(output, path=folder), fps=fps, warn=reporter.warn)
+    alone = tuple(replace(frame, image=None, mask=None, split=None) for frame in frames)
+    capture = Capture(alone, np.zeros((0, 3)), (), None, "camera-path")
+    listed, path = folder / "cameras.json", folder / "camera_path.json"
+    output.refuse_existing(listed, path)
+    for loss in losses_camera_path(capture):
+        reporter.warn(f"{path.name} cannot hold {loss}; use {listed.name} instead")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    write_transforms(capture, listed)
+    write_camera_path(capture, path, fps=fps)
     return folder

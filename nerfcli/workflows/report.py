@@ -45,7 +45,7 @@ def report_runs(
     """
     target = output.at(runs[0] / REPORT if len(runs) == 1 else runs[0].resolve().parent / REPORT)
     claim_page(output, target, mark_of(runs), about="report")
-    cores = resources.begin()
+    resources.begin()
     opened, facts, hashes = [], [], []
     for path, label in zip(runs, labels_of(runs), strict=True):
         run = load_run(path)
@@ -73,7 +73,7 @@ def report_runs(
                 "run the command again when the training is complete",
             )
         frames = [frame for frame in run.cameras.test if frame.name in names[index]]
-        held_out = held_out_photos(run, frames, threads=cores)
+        held_out = held_out_photos(run, frames)
         compared = [photo for photo in held_out if photo.used is None or photo.used.any()]
         photos = photo_depths(run, model, on_progress=lambda fraction: None, notify=reporter.note)
         looks.append(look_at(model, compared, depth=depth, photo_depths=photos, on_progress=on_progress))

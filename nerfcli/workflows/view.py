@@ -33,7 +33,6 @@ def view_run(
     run: str | Path,
     address: Address = Address(),
     *,
-    browser: bool = False,
     resources: Resources = Resources(),
     on_ready: Callable[[str, str], None],
 ) -> None:
@@ -42,7 +41,6 @@ def view_run(
     Args:
         run: the folder that `train_scene` wrote, or is writing.
         address: where to listen.
-        browser: open the page in a browser, if this machine has a screen.
         resources: threads for pictures.
         on_ready: called with the page's address and the command that makes it work on another machine ("" for none).
 
@@ -58,8 +56,6 @@ def view_run(
     with PageServer(RunData(path, resources), address) as server:
         url = server.url(LOCAL if host in ("0.0.0.0", "::") else host)
         on_ready(url, _from_elsewhere(server.port) if local else "")
-        if browser:
-            open_browser(url)
         server.serve_forever()
 
 

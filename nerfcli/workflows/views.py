@@ -5,29 +5,21 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-import numpy as np
-
-from nerfcli.atomic import cannot_write
 from nerfcli.cameras import paths
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame, frames_named
 from nerfcli.cameras.framing import Window, cropped, equirectangular, sized, with_lens
-from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.camera_path import find_camera_path, losses_camera_path, read_path, write_camera_path
+from nerfcli.captures.formats.camera_path import find_camera_path, read_path
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.registry import recognise
-from nerfcli.captures.formats.transforms import write_transforms
 from nerfcli.captures.loading import with_photos_on_disk
 from nerfcli.errors import UserError
-from nerfcli.notices import Notify, warn_python
-from nerfcli.output import Output
+from nerfcli.notices import Notify
 from nerfcli.photos.loading import downscaled_camera
 from nerfcli.render.depth import DepthRequest
 from nerfcli.training.runs.run import Run
 
 PATHS = ("orbit", "ellipse", "spiral", "interpolate")
-# Files that `write_frames` writes.
-_FRAME_FILES = ("cameras.json", "camera_path.json")
 
 
 @dataclass(frozen=True)
@@ -190,27 +182,6 @@ def file_fps(cameras: str) -> float | None:
     path = Path(cameras)
     found = find_camera_path(path) if path.is_file() else None
     return None if found is None else read_path(found).fps
-
-
-def write_frames(frames: Sequence[Frame], output: Output, *, fps: float, warn: Notify = warn_python) -> None:
-    """Write views into a folder: cameras.json, in transforms format, and camera_path.json for nerfstudio's viewer.
-
-    Raises:
-        UserError: one of the files exists, or cannot be written.
-    """
-    views = tuple(replace(frame, image=None, mask=None, split=None) for frame in frames)
-    capture = Capture(views, np.zeros((0, 3)), (), None, "camera-path")
-    target = output.at(Path())
-    listed, path = (target / name for name in _FRAME_FILES)
-    output.refuse_existing(listed, path)
-    for loss in losses_camera_path(capture):
-        warn(f"{path.name} cannot hold {loss}; use {listed.name} instead")
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(target, error) from error
-    write_transforms(capture, listed)
-    write_camera_path(capture, path, fps=fps)
 
 
 def _frames_of(path: Path) -> tuple[Frame, ...]:

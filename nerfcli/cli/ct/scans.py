@@ -212,6 +212,9 @@ class FitOptions:
             "measured if it varies by more than the noise."
         ),
     ] = "auto"
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue from the volume of the run to the new total; without one, start.")
+    ] = False
 
     def settings(self, threads: int) -> "ReconstructionSettings":
         """Return the settings that the options select.
@@ -243,9 +246,6 @@ def train(
     *,
     writing: options.Writing,
     fit: FitOptions,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue from the volume of the run to the new total; without one, start.")
-    ] = False,
     threads: options.Threads = 0,
     printing: options.Printing,
 ) -> None:
@@ -270,7 +270,7 @@ def train(
         _refuse_other_formats(given.path)
         run = writing.beside(given, "-run")
         with console.stage(f"train {given.path.name}") as reporter:
-            train_scan(given.path, run, settings, resume=resume, reporter=reporter)
+            train_scan(given.path, run, settings, resume=fit.resume, reporter=reporter)
         console.result(run.at(given.path))
 
     for_each_input(scan, work, command="ct train")

@@ -3,7 +3,7 @@
 import hashlib
 import platform
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -59,18 +59,9 @@ class RunConfig:
     versions: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def describing(
-        cls,
-        scene: Capture,
-        settings: TrainSettings,
-        *,
-        factor: int,
-        contraction: str,
-        selection: Selection | None = None,
-    ) -> "RunConfig":
-        """Describe a training that begins now."""
+    def describing(cls, scene: Capture) -> "RunConfig":
+        """Describe a training of a scene that begins now; its settings and selection are still to be filled in."""
         return cls(
-            settings=replace(settings, downscale=factor, contraction=contraction),
             scene=scene.root,
             scene_kind=scene.kind,
             unit=scene.unit,
@@ -81,7 +72,6 @@ class RunConfig:
             history=dict(scene.provenance),
             missing_photos=tuple(scene.missing),
             warnings=tuple(describe_rescaling(scene.rescaled)),
-            selection=selection,
             versions={
                 "nerfcli": __version__,
                 "python": platform.python_version(),
