@@ -30,7 +30,7 @@ from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
 from nerfcli.training.runs.settings import TrainSettings
-from nerfcli.workflows.train import train_scene, was_interrupted
+from nerfcli.workflows.train import train_scene
 
 # Fraction of the photos that is withheld on one side; every how many photos is, too.
 WITHHELD, CONTROL_EVERY = 0.25, 8
@@ -174,9 +174,8 @@ def main(
             budget_seconds=None, steps=steps, downscale=downscale, seed=seed, threads=threads, model="default"
         )
         path = output / f"seed-{seed}"
-        resume = was_interrupted(place, path, settings, holdout=str(names))
         model = train_scene(
-            place, Output(path), settings, holdout=str(names), resume=resume, reporter=Reporter(note=print)
+            place, Output(path), settings, holdout=str(names), resume=None, reporter=Reporter(note=print)
         ).model()
         rendered.append(distances(model, views))
         if seed == 0:

@@ -47,8 +47,12 @@ class Resources:
         return device_name(self.device)
 
     def memory_limit(self, device: str = "cpu") -> int | None:
-        """Return the limit in bytes; None where there is none."""
-        return self.memory_bytes or default_memory_limit(device)
+        """Return the limit of this process in bytes; None where there is none.
+
+        Processes that torchrun has started on this machine share its memory; each has a GPU of its own.
+        """
+        limit = self.memory_bytes or default_memory_limit(device)
+        return limit if limit is None or device != "cpu" else limit // local_rank_and_size()[1]
 
     def begin(self) -> int:
         """Have torch use the threads, from the calling thread, and return their number."""

@@ -19,6 +19,7 @@ from nerfcli.captures.formats.registry import format_named, recognise
 from nerfcli.captures.loading import load_scene
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.notices import Reporter
+from nerfcli.output import Output
 from nerfcli.photos.images import read_image
 from nerfcli.workflows.convert import convert_capture
 from nerfcli.workflows.describe import describe
@@ -36,7 +37,7 @@ def packed(folder: Path, path: Path, *, inside: str = "") -> Path:
 
 
 def unpack(path: Path, result: Path, *, overwrite: bool = False) -> Path:
-    return unpacked(path, result, overwrite=overwrite, reporter=Reporter())
+    return unpacked(path, Output(result, overwrite), reporter=Reporter())
 
 
 def entry(name: str, *, mode: int = stat.S_IFREG | 0o644) -> zipfile.ZipInfo:

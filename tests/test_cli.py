@@ -740,7 +740,7 @@ def test_run_trains_a_capture_with_the_poses_that_it_has(monkeypatch, capture, i
         trained.append((scene, output.path))
         raise UserError("enough", "of this test")
 
-    monkeypatch.setattr("nerfcli.workflows.train.train_scene", only_asked)
+    monkeypatch.setattr("nerfcli.workflows.pipeline.train_scene", only_asked)
     given = Path(shutil.make_archive(str(capture), "zip", capture)) if is_archive else capture
     result = nerfcli("run", given)
     assert error_of(result)[0] == "Error: enough"

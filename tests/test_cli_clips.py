@@ -9,7 +9,7 @@ from commands import estimated_poses, nerfcli
 
 from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
 from nerfcli.poses import structure_from_motion
-from nerfcli.workflows import train as train_workflow
+from nerfcli.workflows import pipeline
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def test_run_takes_a_video_too(clip, estimated, monkeypatch):
     def stop(*args: Any, **settings: Any) -> None:
         raise UserError("far enough", "")
 
-    monkeypatch.setattr(train_workflow, "train_scene", stop)
+    monkeypatch.setattr(pipeline, "train_scene", stop)
     assert "far enough" in nerfcli("run", clip, "--frames", "6", "-o", "all").stderr
     assert "far enough" in nerfcli("run", clip, "--frames", "6").stderr
     assert estimated == [("all/frames", "all/scene", 6), ("my clip-frames", "my clip-scene", 6)]

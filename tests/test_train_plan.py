@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from nerfcli.captures.capture import Capture
 from nerfcli.cli import app
 from nerfcli.errors import OUT_OF_MEMORY, UserError
+from nerfcli.machine import Resources
 from nerfcli.training.loop import train
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import SHOWN, THRESHOLD
@@ -33,11 +34,11 @@ def test_photos_that_memory_cannot_hold_are_on_the_disk() -> None:
     """At least the RGBA bytes of 24 photos of 96 x 72, besides those that the search and cameras keep."""
     free = plan_training(SPHERES, STEPS)
     assert (free.train_photos, free.held_out_photos, free.downscale, free.pixels) == (21, 3, 1, 21 * 96 * 72)
-    limited = plan_training(SPHERES, STEPS, memory_bytes=free.memory_bytes - 10_000)
+    limited = plan_training(SPHERES, STEPS, resources=Resources(memory_bytes=free.memory_bytes - 10_000))
     assert limited.memory_bytes == free.memory_bytes - 10_000
     assert limited.disk_bytes - free.disk_bytes >= 24 * 96 * 72 * 4
     with pytest.raises(UserError) as refused:
-        plan_training(SPHERES, STEPS, memory_bytes=10**7)
+        plan_training(SPHERES, STEPS, resources=Resources(memory_bytes=10**7))
     assert refused.value.exit_code == OUT_OF_MEMORY
 
 

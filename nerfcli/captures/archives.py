@@ -21,6 +21,7 @@ from nerfcli.captures.formats.fields import read_json_object
 from nerfcli.captures.formats.registry import ARCHIVES, photo_folder, recognised
 from nerfcli.errors import UserError, several
 from nerfcli.notices import Progress, Reporter
+from nerfcli.output import Output
 
 # What is in the folder of an unpacked archive besides its files.
 ARCHIVE_FILE = "archive.json"
@@ -43,23 +44,23 @@ def is_archive(path: Path) -> bool:
     return path.suffix.lower() in ARCHIVES and path.is_file()
 
 
-def unpacked(path: Path, beside: Path, *, overwrite: bool, reporter: Reporter) -> Path:
+def unpacked(path: Path, output: Output, *, reporter: Reporter) -> Path:
     """Return the folder of a capture: that of an archive's files, unpacked unless they are there; else the path itself.
 
     Args:
-        beside: the result that is made of the capture; the files go to NAME-unpacked in its folder, all or nothing.
-        overwrite: replace files that were unpacked from another archive. Nothing else is ever replaced.
+        output: where the result that is made of the capture goes; the files go to NAME-unpacked beside it, all or
+            nothing. If it may be replaced, so may files of another archive; nothing else is ever replaced.
 
     Raises:
         UserError: the archive is damaged, encrypted, or not safe to unpack; or the folder contains something else.
     """
     if not is_archive(path):
         return path
-    folder = beside.absolute().parent / f"{path.stem}-unpacked"
+    folder = output.at(path).absolute().parent / f"{path.stem}-unpacked"
     with _opened(path) as archive, reporter.stage(f"unpack {path.name}") as stage:
         members = _checked(path, archive.infolist())
         content = {"archive": path.name, "bytes": path.stat().st_size, "files": _digest(members)}
-        if not _is_kept(folder, content, path, overwrite=overwrite):
+        if not _is_kept(folder, content, path, overwrite=output.overwrite):
             _extract(archive, members, folder, content, stage.progress)
             stage.note(f"{folder}: {several(len(members), 'file')} of {path.name}")
         else:

@@ -10,7 +10,7 @@ from nerfcli.cli import options
 from nerfcli.cli.batch import STDIN, Given, for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.errors import in_shell
-from nerfcli.machine import is_first, is_one_of_several, local_rank_and_size
+from nerfcli.machine import Resources, is_first, is_one_of_several
 
 if TYPE_CHECKING:
     from nerfcli.training.runs.settings import TrainSettings
@@ -21,7 +21,7 @@ DEFAULT_BUDGET = "2m"
 
 @dataclass(frozen=True)
 class Fit:
-    """How long is trained, and what."""
+    """What is trained, for how long, and from where on."""
 
     budget: Annotated[
         str | None, typer.Option(help="Training time: 90s, 5m, 1h; 90 is 90 s.  [default: 2m, or none with --steps]")
@@ -56,6 +56,14 @@ class Fit:
         ),
     ] = None
     memory: options.DeviceMemory = None
+    holdout: options.Holdout = None
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Continue from the last checkpoint to the new total; without one, start."),
+    ] = False
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show how much memory, disk and time it would take, and its schedule.")
+    ] = False
 
     def settings(self, training: options.Training) -> "TrainSettings":
         """Return the settings that the options select.
@@ -87,11 +95,14 @@ class Fit:
             field_memory_bytes=size,
         )
 
-    def memory_limit(self, device: str) -> int | None:
-        """Return the limit in bytes for all processes of this machine, of the GPU or of resident memory."""
-        from nerfcli.machine import default_memory_limit
+    def resources(self, training: options.Training) -> Resources:
+        """Return what the training may use of this machine.
 
-        return default_memory_limit(device) if self.memory is None else options.bytes_from_text(self.memory)
+        Raises:
+            typer.BadParameter: the limit of memory cannot be parsed.
+        """
+        limit = None if self.memory is None else options.bytes_from_text(self.memory)
+        return replace(training.resources, memory_bytes=limit)
 
 
 @command
@@ -100,14 +111,6 @@ def train(
     writing: options.Writing,
     fit: Fit,
     training: options.Training,
-    holdout: options.Holdout = None,
-    resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Continue from the last checkpoint to the new total; without one, start."),
-    ] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show how much memory, disk and time it would take, and its schedule.")
-    ] = False,
     *,
     printing: options.Printing,
 ) -> None:
@@ -158,29 +161,20 @@ def train(
     from nerfcli.errors import UserError
     from nerfcli.workflows.train import plan_training, train_scene
 
-    if is_one_of_several() and (dry_run or scene == STDIN):
+    if is_one_of_several() and (fit.dry_run or scene == STDIN):
         raise UserError("processes of torchrun train one field of photos", "use this command without torchrun", 2)
     console = Console(quiet=printing.quiet or not is_first(), json_lines=printing.json)
-    rule, settings = options.holdout_rule(holdout), fit.settings(training)
-    limit, on_gpu = fit.memory_limit(settings.device), settings.device != "cpu"
+    settings = fit.settings(training)
+    how = {"holdout": options.holdout_rule(fit.holdout), "resources": fit.resources(training)}
 
     def work(given: Given) -> None:
         output = writing.beside(given, "-run")
-        if dry_run:
-            resident = fit.memory_limit("cpu") if not on_gpu else None
-            plan = plan_training(given.path, settings, memory_bytes=resident, holdout=rule)
+        if fit.dry_run:
+            plan = plan_training(given.path, settings, **how)
             show_plan(plan, given.path, console, with_schedule=not printing.json)
             return
         with console.stage(f"train {given.path.name}") as reporter:
-            run = train_scene(
-                given.path,
-                output,
-                settings,
-                memory_bytes=limit if limit is None or on_gpu else limit // local_rank_and_size()[1],
-                resume=resume,
-                holdout=rule,
-                reporter=reporter,
-            )
+            run = train_scene(given.path, output, settings, resume=fit.resume, **how, reporter=reporter)
         if is_first():
             console.result(run.path)
         if not given.one_of_many:

@@ -102,18 +102,7 @@ def prepare(
             notify(decision.in_words())
 
     inputs = _with_evidence(inputs, settings.components, evidence)
-    if settings.components.points:
-        if inputs.points is None or evidence.track_depths is None:
-            raise UserError(
-                f"--with points: no 3D point could be triangulated from the photos of {scene.root}",
-                "use a scene written by nerfcli poses or a COLMAP model, or remove --with points",
-            )
-        if settings.model != "auto" or "points" in settings.fixed:  # else the decision on points reports it
-            notify(f"points: {len(evidence.track_depths.numbers):,} pixels see a 3D point at a known distance")
-    if settings.components.sensor and (evidence.sensor_depths is None or not len(evidence.sensor_depths.numbers)):
-        raise UserError(
-            f"--with sensor: {scene.root} has no depth maps of a sensor that its photos confirm", "remove --with sensor"
-        )
+    _check_depths(scene, inputs, evidence, notify=notify)
     log_exposure, log_gains = _exposures(scene, settings.components, evidence, selection, notify=notify)
     return replace(
         inputs,
@@ -226,6 +215,23 @@ def _with_evidence(inputs: TrainingInputs, components: Components, evidence: Evi
         sky=evidence.sky,
         occluders=occluders,
     )
+
+
+def _check_depths(scene: Capture, inputs: TrainingInputs, evidence: Evidence, *, notify: Callable[[str], None]) -> None:
+    """Refuse a training whose components need depths that are not known; report how many points there are."""
+    settings, components = inputs.settings, inputs.settings.components
+    if components.points:
+        if inputs.points is None or evidence.track_depths is None:
+            raise UserError(
+                f"--with points: no 3D point could be triangulated from the photos of {scene.root}",
+                "use a scene written by nerfcli poses or a COLMAP model, or remove --with points",
+            )
+        if settings.model != "auto" or "points" in settings.fixed:  # else the decision on points reports it
+            notify(f"points: {len(evidence.track_depths.numbers):,} pixels see a 3D point at a known distance")
+    if components.sensor and (evidence.sensor_depths is None or not len(evidence.sensor_depths.numbers)):
+        raise UserError(
+            f"--with sensor: {scene.root} has no depth maps of a sensor that its photos confirm", "remove --with sensor"
+        )
 
 
 def _exposures(

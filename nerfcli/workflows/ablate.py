@@ -24,7 +24,6 @@ from nerfcli.captures.loading import load_scene
 from nerfcli.errors import UserError
 from nerfcli.evaluate.photos import held_out_photos
 from nerfcli.evaluate.sampled import SampledPixels
-from nerfcli.machine import default_memory_limit
 from nerfcli.notices import Reporter
 from nerfcli.output import Output
 from nerfcli.photos.exif import mean_log_exposure, relative_log_exposures
@@ -32,7 +31,7 @@ from nerfcli.photos.images import read_image
 from nerfcli.training.runs.files import STATE
 from nerfcli.training.runs.run import Run
 from nerfcli.training.runs.settings import TrainSettings
-from nerfcli.workflows.train import train_scene, was_interrupted
+from nerfcli.workflows.train import train_scene
 
 _SAME = "; the same pixels for all variants of a seed, other pixels for each seed"
 
@@ -69,15 +68,8 @@ def ablate_scene(
     def trained(name: str, settings: TrainSettings) -> Run:
         """Return a run with these settings, trained now or by an earlier call."""
         target = folder / RUNS / f"{name}-{settings.seed}"
-        resume = not output.overwrite and was_interrupted(path, target, settings)
-        run = train_scene(
-            path,
-            Output(target, output.overwrite),
-            settings,
-            memory_bytes=default_memory_limit(settings.device),
-            resume=resume,
-            reporter=Reporter(warn=reporter.warn),
-        )
+        where, quiet = Output(target, output.overwrite), Reporter(warn=reporter.warn)
+        run = train_scene(path, where, settings, resume=None, reporter=quiet)
         # The training state is three times as large as the field, and complete trainings are not resumed.
         (target / STATE).unlink(missing_ok=True)
         return run

@@ -14,6 +14,7 @@ from nerfcli.captures.orientation import STORED, describe_rescaling, in_pixels, 
 from nerfcli.captures.world import WorldFrame, in_world_frame
 from nerfcli.errors import UserError, listed, several
 from nerfcli.notices import Reporter
+from nerfcli.output import Output
 from nerfcli.photos.images import UNUSUAL_SUFFIXES
 from nerfcli.poses.input.video_frames import extract_frames, frames_folder
 
@@ -39,8 +40,9 @@ def convert_capture(
         UserError: the capture cannot be read or written, the format cannot hold it, or what was written differs.
     """
     to = wanted.form.name
-    source = unpacked(source, target, overwrite=wanted.overwrite, reporter=reporter)
-    given = _with_frames(source, target, given, overwrite=wanted.overwrite, reporter=reporter)
+    output = Output(target, wanted.overwrite)
+    source = unpacked(source, output, reporter=reporter)
+    given = _with_frames(source, output, given, reporter)
     form, found, capture = load(source, given, overrides)
     reporter.note(f"{found}: {form.name}, {contents(capture)}")
     for text in capture.notes:
@@ -75,15 +77,18 @@ def convert_capture(
     return done, _record(done, to) | frame
 
 
-def _with_frames(source: Path, target: Path, given: UserInputs, *, overwrite: bool, reporter: Reporter) -> UserInputs:
-    """Return the user's inputs, with the frames of a capture's video, written beside the target if it has no photos."""
+def _with_frames(source: Path, output: Output, given: UserInputs, reporter: Reporter) -> UserInputs:
+    """Return the user's inputs, with the frames of a capture's video, written beside the output if it has no photos."""
     form, found = recognise(source)
     video = None if given.images is not None else form.video(found)
     if video is None or any(frame.has_photo for frame in form.parse(found, given).frames):
         return given
+    target = output.at(source)
     folder = frames_folder(target.with_suffix("") if target.suffix else target)
     with reporter.stage(f"extract frames of {video.name}") as stage:
-        extract_frames(video, folder, count=None, overwrite=overwrite, notify=stage.note, progress=stage.progress)
+        extract_frames(
+            video, folder, count=None, overwrite=output.overwrite, notify=stage.note, progress=stage.progress
+        )
     return replace(given, images=folder)
 
 

@@ -13,13 +13,13 @@ from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.render.job import OUTPUTS, ExportSettings, VideoSettings
 from nerfcli.training.runs.run import Run
 from nerfcli.training.runs.settings import TrainSettings, sizes_for
-from nerfcli.workflows import train
 from nerfcli.workflows.evaluate import Evaluation, evaluate_run, evaluate_splats
 from nerfcli.workflows.export import default_target, export_run
 from nerfcli.workflows.poses import estimate_poses, without_suffix
 from nerfcli.workflows.render import render_run
 from nerfcli.workflows.report import report_runs
 from nerfcli.workflows.splats import SplatSettings
+from nerfcli.workflows.train import train_scene
 from nerfcli.workflows.views import Views, usual_depth
 
 
@@ -78,10 +78,8 @@ def run_pipeline(
     Raises:
         UserError: as the functions of the stages do. After a KeyboardInterrupt, the same call continues.
     """
-    device, again = resources.torch_device, output.overwrite
-    usual_training = TrainSettings(budget_seconds=120.0, model="auto", **sizes_for(device))
-    settings = replace(training or usual_training, threads=resources.cores, device=device)
-
+    settings, again = training or _usual_training(resources), output.overwrite
+    settings = replace(settings, threads=resources.cores, device=resources.torch_device)
     scene_output = Output(None if output.path is None else Path(output.path) / "scene", again)
     capture = _capture_of(Path(photos), scene_output, reporter)
     scene = capture or estimate_poses(
@@ -96,7 +94,7 @@ def run_pipeline(
     named = without_suffix(Path(photos) if capture else scene)
     run_path = beside(named, "-run") if output.path is None else Path(output.path) / "run"
     with reporter.stage(f"train {scene.name}") as stage:
-        run = _trained(scene, Output(run_path, again), settings, resources, stage)
+        run = train_scene(scene, Output(run_path, again), settings, resume=None, resources=resources, reporter=stage)
     usual = Output(overwrite=again)
     with reporter.stage("evaluate") as stage:
         evaluation = evaluate_run(run.path, usual, resources=resources, reporter=stage)
@@ -129,24 +127,15 @@ def run_pipeline(
     return PipelineResult(scene, run, evaluation, splats, of_splats, renders, report)
 
 
+def _usual_training(resources: Resources) -> TrainSettings:
+    return TrainSettings(budget_seconds=120.0, model="auto", **sizes_for(resources.torch_device))
+
+
 def _capture_of(photos: Path, output: Output, reporter: Reporter) -> Path | None:
     """Return the folder of the capture with poses that was given, from a zip archive if it is one; None for photos."""
-    folder = unpacked(photos, output.beside(photos, "-scene"), overwrite=output.overwrite, reporter=reporter)
+    folder = unpacked(photos, Output(output.beside(photos, "-scene"), output.overwrite), reporter=reporter)
     found = recognised(folder)
     if found is None:
         return None
     reporter.note(f"{photos} has poses ({found[0].of}), which are used; for new ones, give the folder of its photos")
     return folder
-
-
-def _trained(scene: Path, output: Output, settings: TrainSettings, resources: Resources, stage: Reporter) -> Run:
-    """Train, or go on with a training that was interrupted."""
-    path = output.at(scene)
-    return train.train_scene(
-        scene,
-        output,
-        settings,
-        memory_bytes=resources.memory_limit(settings.device),
-        resume=not output.overwrite and train.was_interrupted(scene, path, settings),
-        reporter=stage,
-    )

@@ -74,7 +74,7 @@ def estimate_poses(
     target = output.beside(without_suffix(source), "-scene")
     folder = source
     if is_archive(source):
-        files = unpacked(source, target, overwrite=output.overwrite, reporter=reporter)
+        files = unpacked(source, Output(target, output.overwrite), reporter=reporter)
         folder = photo_folder(files) or files
     elif source.is_file():
         folder = frames_folder(target)

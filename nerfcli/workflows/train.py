@@ -21,7 +21,7 @@ from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.errors import UserError, duration, listed, several
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import chosen_size, closing_steps
-from nerfcli.machine import is_one_of_several
+from nerfcli.machine import Resources, is_one_of_several
 from nerfcli.notices import Reporter, silent
 from nerfcli.output import Output
 from nerfcli.training import loop
@@ -42,9 +42,9 @@ def train_scene(
     output: Output = Output(),
     settings: TrainSettings = TrainSettings(),
     *,
-    memory_bytes: int | None = None,
-    resume: bool = False,
+    resume: bool | None = False,
     holdout: str | None = None,
+    resources: Resources = Resources(),
     reporter: Reporter = Reporter(),
 ) -> Run:
     """Train one scene, keep a complete run with the same settings, or refuse to touch another one.
@@ -61,9 +61,10 @@ def train_scene(
         scene: a folder that `estimate_poses` wrote, or of another format that `load_scene` reads.
         output: the folder to write, SCENE-run by default.
         settings: budget, components, resolution, seed, device, threads.
-        memory_bytes: limit of resident memory, or of memory on the GPU that trains; None for no limit.
-        resume: continue from the last checkpoint of the run; start from the beginning if there is none.
+        resume: continue from the last checkpoint of the run; start from the beginning if there is none. None to do so
+            only if a training of this scene with these settings was interrupted.
         holdout: photos to hold out, "every:8", "block:0.15" or a file of names; None for the scene's own split.
+        resources: limit of memory; device and threads are those of the settings.
         reporter: its progress is the fraction of the budget, after every step.
 
     Returns:
@@ -75,59 +76,87 @@ def train_scene(
     """
     given = Path(scene)
     run = output.beside(given, "-run")
-    folder = unpacked(given, run, overwrite=output.overwrite, reporter=reporter)
+    folder = unpacked(given, Output(run, output.overwrite), reporter=reporter)
     loaded = load_scene(folder, holdout=holdout)
     _describe(folder, loaded, reporter)
+    if resume is None:
+        resume = not output.overwrite and _was_interrupted(Run(run), loaded, settings)
     if resume and not Run(run).is_trained and not (run / STATE).exists():
         # A script that a scheduler starts again always gives --resume, and may have been ended before a checkpoint.
         resume = False
         _refuse_others(run)
         reporter.note(f"{run} has no checkpoint to resume; the training starts from the beginning")
-
-    def fit(place: Path, **told: Any) -> None:
-        loop.train(loaded, place, settings, resume=resume, memory_bytes=memory_bytes, **told)
-
+    task = _Task(loaded, run, settings, resources.memory_limit(settings.device), resume, output.overwrite)
     if is_one_of_several():
         distributed.join(settings.device)
     if distributed.rank() > 0:
-        # The first process decides whether to train, keeps what comes of it, and reports.
-        if distributed.from_first(lambda: True):  # or what the first one says instead
-            with TemporaryDirectory() as nobody_reads, suppress(KeyboardInterrupt):
-                fit(Path(nobody_reads), notify=silent, on_progress=lambda state: None)
-        return Run(run)
+        _help(task)
+    elif not _is_kept(task, reporter):
+        with exclusive(run / LOCK, f"nerfcli train is working on {run}"):
+            if not _is_kept(task, reporter):  # another process may just have completed it
+                _train(task, reporter)
+    return Run(run)
 
-    def is_kept() -> bool:
-        if not _keeps(run, loaded, settings, resume=resume, overwrite=output.overwrite):
-            return False
-        distributed.from_first(lambda: False)
-        complete = "it is complete and has these settings; add --overwrite to train again"
-        used = "its training has used this budget; give a larger --budget or --steps"
-        reporter.note(f"{run} is kept: {used if resume else complete}")
-        return True
+
+@dataclass(frozen=True)
+class _Task:
+    """A training to carry out; see `train_scene` and `loop.train`."""
+
+    scene: Capture
+    run: Path
+    settings: TrainSettings
+    memory_bytes: int | None
+    resume: bool
+    overwrite: bool
+
+    def fit(self, folder: Path, **told: Any) -> None:
+        """Train into a folder."""
+        memory_bytes = self.memory_bytes
+        loop.train(self.scene, folder, self.settings, resume=self.resume, memory_bytes=memory_bytes, **told)
+
+
+def _help(task: _Task) -> None:
+    """Train with the first process, which decides whether to, keeps what comes of it, and reports."""
+    if distributed.from_first(lambda: True):  # or what the first one says instead
+        with TemporaryDirectory() as nobody_reads, suppress(KeyboardInterrupt):
+            task.fit(Path(nobody_reads), notify=silent, on_progress=lambda state: None)
+
+
+def _is_kept(task: _Task, reporter: Reporter) -> bool:
+    """Return whether the run is there and stays, and say so."""
+    if not _keeps(task):
+        return False
+    distributed.from_first(lambda: False)
+    complete = "it is complete and has these settings; add --overwrite to train again"
+    used = "its training has used this budget; give a larger --budget or --steps"
+    reporter.note(f"{task.run} is kept: {used if task.resume else complete}")
+    return True
+
+
+def _train(task: _Task, reporter: Reporter) -> None:
+    run, budget = task.run, task.settings.budget_seconds
 
     def on_progress(state: loop.Progress) -> None:
         speed = f"{state.samples_per_second / 1e3:.0f} k samples/s"
-        budget = settings.budget_seconds
         left = "" if budget is None else f", {duration(max(0.0, budget - state.seconds))} left"
         reporter.progress(state.fraction, f"step {state.step}  loss {state.loss:.4f}  {speed}{left}")
 
-    if is_kept():
-        return Run(run)
-    with exclusive(run / LOCK, f"nerfcli train is working on {run}"):
-        if is_kept():  # another process has just completed it
-            return Run(run)
-        clear_leftovers(run)
-        if output.overwrite:
-            (run / METRICS).unlink(missing_ok=True)  # they belong to the field that is replaced
-        distributed.from_first(lambda: True)
-        reporter.progress(0.0, "")
-        try:
-            fit(run, notify=reporter.note, on_progress=on_progress)
-        except KeyboardInterrupt:
-            if (run / STATE).exists():
-                reporter.note(f"checkpoint saved in {run}; to continue, add --resume to the same command")
-            raise
-    return Run(run)
+    clear_leftovers(run)
+    if task.overwrite:
+        (run / METRICS).unlink(missing_ok=True)  # they belong to the field that is replaced
+    distributed.from_first(lambda: True)
+    reporter.progress(0.0, "")
+    try:
+        task.fit(run, notify=reporter.note, on_progress=on_progress)
+    except KeyboardInterrupt:
+        if (run / STATE).exists():
+            reporter.note(f"checkpoint saved in {run}; to continue, add --resume to the same command")
+        raise
+
+
+def _was_interrupted(run: Run, scene: Capture, settings: TrainSettings) -> bool:
+    """Return whether a training of this scene with these settings was interrupted and left a checkpoint."""
+    return run.is_trained and run.is_trained_from(scene, settings) and not run.is_complete(settings)
 
 
 def _describe(folder: Path, scene: Capture, reporter: Reporter) -> None:
@@ -143,18 +172,9 @@ def _describe(folder: Path, scene: Capture, reporter: Reporter) -> None:
         reporter.note(f"unused masks: {text}")
 
 
-def was_interrupted(scene: Path, run: Path, settings: TrainSettings, *, holdout: str | None = None) -> bool:
-    """Return whether a training of this scene with these settings was interrupted and left a checkpoint."""
-    trained = Run(run)
-    if not trained.is_trained:
-        return False
-    loaded = load_scene(scene, holdout=holdout)
-    return trained.is_trained_from(loaded, settings) and not trained.is_complete(settings)
-
-
-def _keeps(path: Path, scene: Capture, settings: TrainSettings, *, resume: bool, overwrite: bool) -> bool:
-    """Return whether the run at `path` is complete with these settings; raise if it may not be replaced otherwise."""
-    run = Run(path)
+def _keeps(task: _Task) -> bool:
+    """Return whether the run is complete with these settings; raise if it may not be replaced otherwise."""
+    path, scene, settings, run = task.run, task.scene, task.settings, Run(task.run)
     masks = {frame.mask.parent: frame.mask for frame in scene.frames if frame.mask is not None}  # one of each folder
     for parent, mask in masks.items():
         if parent.resolve().is_relative_to((path / OCCLUDERS).resolve()):
@@ -162,19 +182,19 @@ def _keeps(path: Path, scene: Capture, settings: TrainSettings, *, resume: bool,
                 f"{path} holds masks that this scene uses, such as {mask}; training would delete them",
                 "choose another folder with -o",
             )
-    if resume and run.config.split_sha256 != split_hash(scene.test_names):
+    if task.resume and run.config.split_sha256 != split_hash(scene.test_names):
         before = run.config.holdout
         raise UserError(
             f"{path} was trained with other held-out photos ({before or 'the split of the scene'})",
             f"give --holdout {before}" if before else "remove --holdout, or choose another folder with -o",
         )
-    if resume and run.config.scene_fingerprint != fingerprint(scene):
+    if task.resume and run.config.scene_fingerprint != fingerprint(scene):
         raise UserError(f"{path} was trained on a different scene than {scene.root}", "choose another folder with -o")
-    if resume and run.is_complete(settings):  # decided before stereo matching is repeated needlessly
+    if task.resume and run.is_complete(settings):  # decided before stereo matching is repeated needlessly
         before = run.config.settings
         same = replace(settings, budget_seconds=before.budget_seconds, steps=before.steps)
         return run.is_trained_from(scene, same)
-    if run.is_trained and not resume and not overwrite:
+    if run.is_trained and not task.resume and not task.overwrite:
         if run.is_trained_from(scene, settings) and run.is_complete(settings):
             return True
         raise UserError(
@@ -233,7 +253,7 @@ class TrainingPlan:
 
 
 def plan_training(
-    scene: str | Path, settings: TrainSettings, *, memory_bytes: int | None = None, holdout: str | None = None
+    scene: str | Path, settings: TrainSettings, *, holdout: str | None = None, resources: Resources = Resources()
 ) -> TrainingPlan:
     """Estimate the cost of `train_scene` without opening photos or writing anything.
 
@@ -243,7 +263,7 @@ def plan_training(
         >>> plan_training("photos-scene", TrainSettings(budget_seconds=300)).memory_bytes
 
     Args:
-        scene, settings, memory_bytes, holdout: as for `train_scene`.
+        scene, settings, holdout, resources: as for `train_scene`.
 
     Raises:
         UserError: the scene cannot be read, has no training photo, or does not fit into memory.
@@ -252,7 +272,8 @@ def plan_training(
     refuse_without_training_photos(loaded)
     factor = settings.downscale or automatic_downscale(loaded.train_frames[0].camera)
     needs = needs_of((*loaded.train_frames, *loaded.test_frames), factor, settings=settings)
-    storage, _ = storage_for(needs, memory_bytes, folder=Path(gettempdir()))
+    limit = resources.memory_limit() if settings.device == "cpu" else None
+    storage, _ = storage_for(needs, limit, folder=Path(gettempdir()))
     in_files = needs.photos if isinstance(storage, InFiles) else 0
     total = needs.photos + needs.rest
     return TrainingPlan(
@@ -260,7 +281,7 @@ def plan_training(
         held_out_photos=len(loaded.test_frames),
         downscale=factor,
         pixels=sum((f.camera.width // factor) * (f.camera.height // factor) for f in loaded.train_frames),
-        memory_bytes=min(total, memory_bytes) if memory_bytes else total,
+        memory_bytes=min(total, limit) if limit else total,
         # The field, the state with both moments of the optimiser, and the previous state until the next is written.
         disk_bytes=(1 + 3 + 3) * field_bytes(settings) + in_files,
         seconds=settings.budget_seconds,
