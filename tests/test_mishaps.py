@@ -19,7 +19,7 @@ from full_disk import files_of_at_most
 from nerfcli import atomic, kernels
 from nerfcli.atomic import exclusive
 from nerfcli.captures.loading import load_scene
-from nerfcli.errors import BAD_INPUT, INTERRUPTED, TERMINATED
+from nerfcli.errors import BAD_INPUT, INTERRUPTED, OUT_OF_MEMORY, TERMINATED
 from nerfcli.interrupts import Terminated, install_handlers
 from nerfcli.training.runs.files import LOCK, PHOTO_DEPTHS
 from nerfcli.workflows import describe
@@ -126,6 +126,18 @@ def test_a_second_training_of_a_run_is_refused_while_the_first_is_at_work(captur
         "Hint:  wait until it has finished, or choose another folder with -o",
     )
     assert [path.name for path in run.iterdir()] == [LOCK]
+
+
+def test_a_refused_training_leaves_no_trace(capture, finished):
+    """For lack of memory: no new folder, no lock in one that was there, and nothing is missing from a run."""
+    there, new, run = capture.with_name("there"), capture.with_name("new"), listing(finished)
+    there.mkdir()
+    for folder in (there, new, finished):
+        line = ("train", capture, "-o", folder, "--overwrite", "--memory", "1MB", *ONE_STEP)
+        assert nerfcli(*line).exit_code == OUT_OF_MEMORY
+    assert not new.exists()
+    assert list(there.iterdir()) == []
+    assert run.items() <= listing(finished).items()
 
 
 def test_a_run_whose_photos_were_moved_elsewhere_says_which_and_how_to_mend_it(finished, capture):

@@ -1,6 +1,7 @@
 """Train a scene, keep an existing run, resume one, or refuse to overwrite another one; plan a training."""
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
@@ -92,7 +93,7 @@ def train_scene(
     if distributed.rank() > 0:
         _help(task)
     elif not _is_kept(task, reporter):
-        with exclusive(run / LOCK, f"nerfcli train is working on {run}"):
+        with _claimed(run):
             if not _is_kept(task, reporter):  # another process may just have completed it
                 _train(task, reporter)
     return Run(run)
@@ -131,6 +132,21 @@ def _is_kept(task: _Task, reporter: Reporter) -> bool:
     used = "its training has used this budget; give a larger --budget or --steps"
     reporter.note(f"{task.run} is kept: {used if task.resume else complete}")
     return True
+
+
+@contextmanager
+def _claimed(run: Path) -> Iterator[None]:
+    """Hold the lock of a run; leave no trace of it where nothing has been written, as when training is refused."""
+    is_new = not run.exists()
+    with exclusive(run / LOCK, f"nerfcli train is working on {run}"):
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                if [entry.name for entry in run.iterdir()] == [LOCK]:
+                    (run / LOCK).unlink()
+                    if is_new:
+                        run.rmdir()
 
 
 def _train(task: _Task, reporter: Reporter) -> None:
