@@ -17,6 +17,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.captures.formats.run_cameras import RunCameras
+from nerfcli.notices import Reporter
 from nerfcli.ply import read_ply_header
 from nerfcli.render.coverage import (
     DepthMap,
@@ -247,21 +248,21 @@ def test_limits_need_depth(run):
 def test_depths_of_photos_are_kept_for_the_field_they_belong_to(run, monkeypatch):
     trained = Run(run)
     fractions: list[float] = []
-    maps = photo_depths(trained, trained.model(), on_progress=fractions.append, notify=pytest.fail)
+    counting = Reporter(pytest.fail, progress=lambda fraction, detail: fractions.append(fraction))
+    maps = photo_depths(trained, trained.model(), counting)
     assert fractions[-1] == 1.0
-    again = photo_depths(
-        trained, trained.model(), on_progress=lambda fraction: pytest.fail("rendered"), notify=pytest.fail
-    )
+    kept = Reporter(pytest.fail, progress=lambda fraction, detail: pytest.fail("rendered"))
+    again = photo_depths(trained, trained.model(), kept)
     for one, other in zip(maps, again, strict=True):
         np.testing.assert_array_equal(one.distances, other.distances)
         assert one.frame.camera == other.frame.camera
     # Another field, or a damaged file: rendered again.
     fractions.clear()
-    photo_depths(trained, replace(trained.model(), sha256="ab"), on_progress=fractions.append, notify=pytest.fail)
+    photo_depths(trained, replace(trained.model(), sha256="ab"), counting)
     assert len(fractions) == 21
     content = (run / PHOTO_DEPTHS).read_bytes()
     (run / PHOTO_DEPTHS).write_bytes(content[: len(content) // 2])
-    photo_depths(trained, trained.model(), on_progress=fractions.append, notify=pytest.fail)
+    photo_depths(trained, trained.model(), counting)
     assert len(fractions) == 42
 
 
@@ -276,9 +277,9 @@ def test_a_photo_sees_nothing_where_its_mask_covers_it(run, tmp_path):
         Image.fromarray(mask).save(tmp_path / name)
     train[0] = replace(first, image=tmp_path / "photo.png", mask=tmp_path / "mask.png")
     masked.__dict__["cameras"] = RunCameras(tuple(train), trained.cameras.test)
-    whole, *others = photo_depths(trained, trained.model(), on_progress=lambda fraction: None, notify=pytest.fail)
+    whole, *others = photo_depths(trained, trained.model(), Reporter(pytest.fail))
     (run / PHOTO_DEPTHS).unlink()  # cached for the photos of the run, whose masks do not change
-    part, *same = photo_depths(masked, masked.model(), on_progress=lambda fraction: None, notify=pytest.fail)
+    part, *same = photo_depths(masked, masked.model(), Reporter(pytest.fail))
     half = whole.distances.shape[1] // 2
     assert np.isfinite(whole.distances[:, :half]).any()
     assert np.isnan(part.distances[:, :half]).all()

@@ -21,12 +21,11 @@ from nerfcli.ply import write_ply
 from nerfcli.render.coverage import coverage_and_parallax
 from nerfcli.render.model import Model
 from nerfcli.training.runs.run import Run
-from nerfcli.version import __version__
 from nerfcli.viewer.packing import pack_model, seen_cells
 from nerfcli.viewer.page import PageNumbers, page_html, scene_of
 from nerfcli.viewer.pictures import make_proof, page_photos
 from nerfcli.workflows.photo_depths import photo_depths
-from nerfcli.workflows.splats import SplatSettings, export_splats, y_up_from_scene
+from nerfcli.workflows.splats import SplatSettings, export_splats, provenance_of, y_up_from_scene
 
 # Maximum size of a page; the field comes first, and photos get the rest.
 PAGE_BYTES = 9_700_000
@@ -105,8 +104,7 @@ def _export_page(run: Run, model: Model, path: Path, *, settings: SurfaceSetting
     box = settings.box or scene_box(model, frames)
     proof = make_proof(model, frames)
     reporter.progress(0.1, "depths of the training photos")
-    depths = reporter.part(0.1, 0.4, "depths of the training photos")
-    seen = photo_depths(run, model, on_progress=depths, notify=reporter.note)
+    seen = photo_depths(run, model, reporter, begin=0.1, end=0.4)
     numbers = PageNumbers.of(packed, proof, seen_cells(model, seen))
     text_bytes = len(numbers.elements)
     photos = page_photos(
@@ -194,18 +192,7 @@ def _description(run: Run, model: Model, kind: str, grid: Grid) -> dict[str, Any
         "frame": FRAME,
         "box": [*grid.low.tolist(), *grid.high.tolist()],
         "voxel_size": grid.voxel_size,
-        **_provenance_of(run, model),
-    }
-
-
-def _provenance_of(run: Run, model: Model) -> dict[str, Any]:
-    """Return the unit of lengths and the run of an exported file."""
-    return {
-        "unit": model.unit,
-        "unit_source": model.unit_source,
-        "nerfcli": __version__,
-        "run": run.path.resolve().name,
-        "field_sha256": model.sha256,
+        **provenance_of(run, model),
     }
 
 

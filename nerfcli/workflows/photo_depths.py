@@ -5,7 +5,7 @@ seconds.
 """
 
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -16,7 +16,7 @@ from nerfcli.atomic import atomic_path, digest, read_sealed, write_sealed
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError, several
 from nerfcli.evaluate.depth_errors import measure_depth_errors
-from nerfcli.notices import Notify
+from nerfcli.notices import Notify, Reporter
 from nerfcli.photos.masks import read_mask
 from nerfcli.render.coverage import MAX_SIZE, STEEPEST_DEG, DepthMap, depth_maps, small_frame
 from nerfcli.render.depth_errors import STRATA, DepthErrors
@@ -31,39 +31,34 @@ LEAST_MATCHED = 0.2
 
 
 def photo_depths(
-    run: Run, model: Model, *, on_progress: Callable[[float], None], notify: Notify
+    run: Run, model: Model, reporter: Reporter, *, begin: float = 0.0, end: float = 1.0
 ) -> tuple[DepthMap, ...]:
     """Return the depth maps of all training photos, read from the run if they were saved for this field.
 
     Args:
         model: its model, with the step lengths of the training.
+        begin, end: fractions of the progress at which they are begun and done.
     """
     frames = run.cameras.train
     expected = _digest(model.sha256, frames)
     kept = _read_photo_depths(run.path, frames, expected=expected)
     if kept is not None:
         return kept
+    on_progress = reporter.part(begin, end, "depths of the training photos")
     maps = depth_maps(model, frames, max_size=MAX_SIZE, on_progress=on_progress)
     if run.components.masks == "ignore":
         maps = [
-            view if frame.mask is None else _without_masked(view, frame, notify)
+            view if frame.mask is None else _without_masked(view, frame, reporter.note)
             for view, frame in zip(maps, frames, strict=True)
         ]
     try:
         _write_photo_depths(run.path, maps, digest=expected)
     except UserError as error:  # runs in read-only folders can be rendered, too
-        notify(f"the depths of the training photos are not kept: {error.message}")
+        reporter.note(f"the depths of the training photos are not kept: {error.message}")
     return tuple(maps)
 
 
-def depth_errors(
-    run: Run,
-    model: Model,
-    photos: Sequence[DepthMap],
-    *,
-    on_progress: Callable[[float], None],
-    notify: Notify,
-) -> DepthErrors:
+def depth_errors(run: Run, model: Model, photos: Sequence[DepthMap], *, reporter: Reporter) -> DepthErrors:
     """Return the errors of the field's depth, read from the run if they were saved for this field.
 
     Raises:
@@ -72,20 +67,21 @@ def depth_errors(
     expected = _digest(model.sha256, [*run.cameras.train, *run.cameras.test])
     errors = _read_depth_errors(run.path, expected=expected)
     if errors is None:
+        on_progress = reporter.part(0.0, 1.0, "depth of the held-out photos")
         errors = measure_depth_errors(run, model, photos, threads=torch.get_num_threads(), on_progress=on_progress)
         try:
             write_sealed(run.path / DEPTH_ERRORS, {"format": ERRORS_FORMAT, "digest": expected, **errors.to_json()})
         except UserError as error:
-            notify(f"the errors of depth are not kept: {error.message}")
+            reporter.note(f"the errors of depth are not kept: {error.message}")
     for least, pixels, quantiles in zip(STRATA, errors.pixels, errors.quantiles, strict=True):
         if np.isnan(quantiles).any():
             seen = several(least, "photo sees", "photos see")
-            notify(f"no intervals or confidence where {seen} the surface: only {pixels} pixels were measured")
-    notify(
+            reporter.note(f"no intervals or confidence where {seen} the surface: only {pixels} pixels were measured")
+    reporter.note(
         f"errors of depth measured at {100.0 * errors.matched:.1f} % of the pixels of {errors.photos} held-out photos"
     )
     if errors.matched < LEAST_MATCHED:
-        notify("what cannot be matched is usually worse: expect more errors than intervals and confidence say")
+        reporter.note("what cannot be matched is usually worse: expect more errors than intervals and confidence say")
     return errors
 
 

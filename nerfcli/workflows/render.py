@@ -91,13 +91,11 @@ def render_run(
         shown, of_file = load_splats(splats, notify=reporter.note), file_digest(Path(splats))
         provenance |= {"splats": Path(splats).name, "splats_sha256": of_file}
     if settings.needs_visibility:
-        depths = reporter.part(0.0, 1.0, "depths of the training photos")
-        seen = photo_depths(trained, model, on_progress=depths, notify=reporter.note)
+        seen = photo_depths(trained, model, reporter)
         provenance["training_photos"] = len(seen)
     errors = None
     if settings.needs_errors:
-        depths = reporter.part(0.0, 1.0, "depth of the held-out photos")
-        errors = depth_errors(trained, model, seen, on_progress=depths, notify=reporter.note)
+        errors = depth_errors(trained, model, seen, reporter=reporter)
         provenance["measured_photos"] = errors.photos
     if settings.depth.convention == "background" and settings.depth.background_distance is None:
         farthest = model.marching.far / model.training_from_scene.scale

@@ -75,7 +75,7 @@ def report_runs(
         frames = [frame for frame in run.cameras.test if frame.name in names[index]]
         held_out = held_out_photos(run, frames)
         compared = [photo for photo in held_out if photo.used is None or photo.used.any()]
-        photos = photo_depths(run, model, on_progress=lambda fraction: None, notify=reporter.note)
+        photos = photo_depths(run, model, Reporter(reporter.note))
         looks.append(look_at(model, compared, depth=depth, photo_depths=photos, on_progress=on_progress))
         meanings.append(depth_meta(model, depth))
     write_page(page_html(facts, looks, depths=meanings, origin=origin), target)

@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -104,16 +105,23 @@ def export_splats(
         "frame": turned,
         "file_from_scene": file_from_scene.to_json(),
         "background": list(splats.background),
+        **provenance_of(run, model),
+    }
+    write_splats(path, gaussians, description=description, notify=reporter.note)
+    reporter.note(
+        f"{len(gaussians)} splats of degree {splats.degree}, {path.stat().st_size / 1e6:.1f} MB, frame: {turned}"
+    )
+
+
+def provenance_of(run: Run, model: Model) -> dict[str, Any]:
+    """Return the unit of lengths and the run of an exported file."""
+    return {
         "unit": model.unit,
         "unit_source": model.unit_source,
         "nerfcli": __version__,
         "run": run.path.resolve().name,
         "field_sha256": model.sha256,
     }
-    write_splats(path, gaussians, description=description, notify=reporter.note)
-    reporter.note(
-        f"{len(gaussians)} splats of degree {splats.degree}, {path.stat().st_size / 1e6:.1f} MB, frame: {turned}"
-    )
 
 
 def y_up_from_scene(run: Run) -> np.ndarray:
