@@ -9,7 +9,7 @@ from nerfcli.captures.archives import unpacked
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.conversion import TOLERANCE_PX, ConventionOverrides, Conversion, TargetOptions, convert, load
 from nerfcli.captures.formats.format import Format, UserInputs
-from nerfcli.captures.formats.registry import recognise, recording
+from nerfcli.captures.formats.registry import recognise
 from nerfcli.captures.orientation import STORED, describe_rescaling, in_pixels, other_sizes
 from nerfcli.captures.world import WorldFrame, in_world_frame
 from nerfcli.errors import UserError, listed, several
@@ -63,8 +63,8 @@ def convert_capture(
             f"{scale.rms_residual:.2g} {unit}" + (f"; {scale.details}" if scale.details else "")
         )
     frame = {"new_from_old": moved.new_from_old.to_json()} | ({} if scale is None else {"scale": scale.to_json()})
-    wanted = replace(wanted, form=recording(wanted.form, {"source": str(found), **frame}))
-    done = convert(moved.capture, target, source_format=form.name, wanted=wanted)
+    capture = replace(moved.capture, provenance={"source": str(found), **frame})
+    done = convert(capture, target, source_format=form.name, wanted=wanted)
     for text in done.notes:
         reporter.note(text)
     suffixes = {frame.image.suffix.lower() for frame in done.capture.frames if frame.image is not None}

@@ -4,10 +4,8 @@ All commands that read captures go through it.
 """
 
 import os
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from nerfcli.cameras.frame import SensorDepth
 from nerfcli.captures.capture import Capture
@@ -41,7 +39,6 @@ from nerfcli.captures.formats import (
     tum_rgbd,
 )
 from nerfcli.captures.formats.format import Format, UserInputs
-from nerfcli.captures.formats.scene_folder import write_scene
 from nerfcli.errors import UserError, in_shell, several
 from nerfcli.photos.images import list_images
 from nerfcli.photos.masks import mask_of
@@ -150,13 +147,6 @@ def format_named(name: str) -> Format:
     raise UserError(
         f"unknown format {name!r}", f"choose one of {', '.join(form.name for form in FORMATS)}", exit_code=2
     )
-
-
-def recording(form: Format, provenance: Mapping[str, Any]) -> Format:
-    """Return the format with `provenance` recorded in the files that it writes, if they have a place for it."""
-    if form.write is not write_scene:
-        return form
-    return replace(form, write=lambda capture, folder: write_scene(capture, folder, provenance=provenance))
 
 
 def depths_beside(photos: Path) -> dict[str, SensorDepth]:

@@ -287,13 +287,11 @@ def losses_scene(capture: Capture) -> tuple[str, ...]:
     return (f"the names of {renamed} photos, which become paths relative to one folder",) if renamed else ()
 
 
-def write_scene(capture: Capture, folder: Path, *, provenance: Mapping[str, Any] | None = None) -> None:
+def write_scene(capture: Capture, folder: Path) -> None:
     """Write a capture, whose cameras are for upright photos, as a scene into a folder.
 
-    Masks are listed one by one. A split in the capture is kept; otherwise every 8th photo is held out.
-
-    Args:
-        provenance: further entries of the provenance in scene.json, besides the command and the version.
+    Masks are listed one by one. A split in the capture is kept; otherwise every 8th photo is held out. The capture's
+    provenance is recorded beside the command and the version.
 
     Raises:
         UserError: a frame has no photo, no photo is on disk, or the folder cannot be written.
@@ -316,7 +314,7 @@ def write_scene(capture: Capture, folder: Path, *, provenance: Mapping[str, Any]
     save(
         folder,
         image_folder=image_folder,
-        provenance={"command": "convert", "from": capture.kind, "nerfcli": __version__, **(provenance or {})},
+        provenance={"command": "convert", "from": capture.kind, "nerfcli": __version__, **capture.provenance},
         unit=capture.unit,
         unit_source=capture.unit_source,
         masks={frame.name: frame.mask for frame in capture.frames if frame.mask is not None},
