@@ -48,10 +48,10 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def listed(names: Sequence[str], most: int = 6) -> str:
-    """Return names separated by commas; if there are more than `most`, the others are only counted."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+def listed(names: Sequence[str]) -> str:
+    """Return names separated by commas; if there are more than six, the others are only counted."""
+    more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+    return ", ".join(names[:6]) + more
 
 
 def in_shell(path: Path) -> str:

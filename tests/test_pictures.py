@@ -134,19 +134,19 @@ def test_quadrature_error_shrinks_with_the_step_and_repeats():
     request = DepthRequest("conditional", "z", 0.1)
     cells = foggy_cells((-1, -1, 0), (1, 1, 4 / SIDE))
     coarse, fine = (
-        measure_error(fog(cells, Similarity.identity(), step=step), TOWARDS, depth=request, tolerance=1e-3)
+        measure_error(fog(cells, Similarity.identity(), step=step), TOWARDS, depth=request)
         for step in (1 / 20, 1 / 160)
     )
     for name in ("colour", "depth"):
         one, other = getattr(coarse, name), getattr(fine, name)
         assert one.values == other.values == 256
         assert one.percentile_95 / other.percentile_95 == pytest.approx(8, rel=0.5)
-    again = measure_error(fog(cells, Similarity.identity(), step=1 / 20), TOWARDS, depth=request, tolerance=1e-3)
+    again = measure_error(fog(cells, Similarity.identity(), step=1 / 20), TOWARDS, depth=request)
     assert again == coarse
     assert "not how close the field is to the scene" in IN_WORDS
     assert coarse.depth is not None
     assert coarse.to_json()["quadrature_of_depth_p95"] == coarse.depth.percentile_95
-    without = measure_error(fog(cells, Similarity.identity(), step=1 / 20), TOWARDS, depth=None, tolerance=1e-3)
+    without = measure_error(fog(cells, Similarity.identity(), step=1 / 20), TOWARDS, depth=None)
     assert without.depth is None
     assert without.colour == coarse.colour
     assert not [name for name in without.to_json() if "depth" in name]

@@ -15,6 +15,8 @@ from nerfcli.render.pictures import Renderable
 from nerfcli.render.tracing import pixel_rays, render_rays
 
 SAMPLED_PIXELS = 2**14
+# Rays that are rendered at a time.
+_RAYS = 4096
 
 
 @dataclass(frozen=True)
@@ -72,9 +74,7 @@ class SampledPixels:
         return float(np.mean(values))
 
 
-def _render_sampled(
-    model: Model, photo: HeldOutPhoto, pixels: np.ndarray, *, at_a_time: int = 4096
-) -> tuple[np.ndarray, np.ndarray]:
+def _render_sampled(model: Model, photo: HeldOutPhoto, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return colours (N, 3) in [0, 1] at pixel centres, in the field's precision, and which of them have a ray."""
     dtype = next(model.field.parameters()).dtype
     rays = pixel_rays(photo.frame, model.training_from_scene, pixels=pixels, device=model.device)
@@ -88,6 +88,6 @@ def _render_sampled(
             background=behind[begin : begin + len(some)],
             cones=rays.cones[begin : begin + len(some)].to(dtype),
         ).rgb
-        for begin, some in zip(range(0, len(directions), at_a_time), directions.split(at_a_time), strict=True)
+        for begin, some in zip(range(0, len(directions), _RAYS), directions.split(_RAYS), strict=True)
     ]
     return torch.cat(colours).clamp(0.0, 1.0).cpu().numpy(), rays.valid.cpu().numpy()

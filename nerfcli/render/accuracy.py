@@ -46,8 +46,8 @@ class MeasuredError:
         colour: of the channel that differs most, sRGB in [0, 1], between whole intervals and intervals cut into 4.
         colour_halved: the same between intervals cut into 2 and into 4: if it is much smaller, the steps converge.
         depth, depth_halved: the same for the requested depth, in the unit of the scene; None without depth.
-        depth_stop: change of depth due to the tolerance; it has no bound, because the light that was left out may end
-            anywhere. None without depth.
+        depth_stop: change of depth due to the tolerance of pictures; it has no bound, because the light that was left
+            out may end anywhere. None without depth.
     """
 
     colour: Spread
@@ -83,21 +83,16 @@ def truncation_bounds(picture: RenderedPicture, tolerance: float) -> dict[str, f
 
 
 @torch.no_grad()
-def measure_error(
-    model: TrainedField, frame: Frame, *, depth: DepthRequest | None, tolerance: float = TOLERANCE, seed: int = 0
-) -> MeasuredError:
-    """Render the centres of 256 random pixels with finer and finer intervals; the same pixels for the same seed.
+def measure_error(model: TrainedField, frame: Frame, *, depth: DepthRequest | None) -> MeasuredError:
+    """Render the centres of 256 random pixels, always the same ones, with finer and finer intervals.
 
     Args:
         frame: camera and pose in the scene's frame.
         depth: the depth to measure along with the colour.
-        tolerance: tolerance of the rendering that `depth_stop` is about.
     """
     total = frame.camera.width * frame.camera.height
-    pixels = np.sort(np.random.default_rng(seed).choice(total, size=min(total, 256), replace=False))
-    rgb, distances = (
-        values.double().cpu().numpy() for values in _renderings(model, frame, pixels, depth=depth, tolerance=tolerance)
-    )
+    pixels = np.sort(np.random.default_rng(0).choice(total, size=min(total, 256), replace=False))
+    rgb, distances = (values.double().cpu().numpy() for values in _renderings(model, frame, pixels, depth=depth))
     with_depth = depth is not None
     return MeasuredError(
         colour=_spread(np.abs(rgb[1] - rgb[3]).max(-1)),
@@ -116,7 +111,7 @@ def refine_cuts(cuts: Tensor, parts: int) -> Tensor:
 
 
 def _renderings(
-    model: TrainedField, frame: Frame, pixels: np.ndarray, *, depth: DepthRequest | None, tolerance: float
+    model: TrainedField, frame: Frame, pixels: np.ndarray, *, depth: DepthRequest | None
 ) -> tuple[Tensor, Tensor]:
     """Return colours (4, P, 3), depths (4, P): as rendered; then at `TIGHT` with intervals whole and cut in 2 and 4."""
     rays = pixel_rays(frame, model.training_from_scene, pixels=pixels, device=model.device)
@@ -135,7 +130,7 @@ def _renderings(
             cones=rays.cones[rays.valid],
             keep_intervals=False,
         )
-        for parts, wanted in ((1, tolerance), (1, TIGHT), (2, TIGHT), (4, TIGHT))
+        for parts, wanted in ((1, TOLERANCE), (1, TIGHT), (2, TIGHT), (4, TIGHT))
     ]
     scale = model.training_from_scene.scale
 
