@@ -1,6 +1,7 @@
 """Colour correction, novelty of views, ledger, requirements: cases with known answers."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from types import ModuleType
 from typing import Any
@@ -148,17 +149,28 @@ def test_registered_is_the_share_of_photos_with_a_pose():
 # LPIPS
 
 
+@pytest.fixture
+def _nothing_is_loaded_yet() -> Iterator[None]:
+    metrics._perceptual.cache_clear()
+    yield
+    metrics._perceptual.cache_clear()
+
+
+@pytest.mark.usefixtures("_nothing_is_loaded_yet")
 def test_without_its_libraries_or_weights_lpips_is_left_out_in_one_line(monkeypatch):
     notes: list[str] = []
+    attempts: list[str] = []
 
     def missing(name: str) -> ModuleType:
         raise ImportError(f"No module named {name!r}")
 
     monkeypatch.setattr(metrics.importlib, "import_module", missing)
     assert metrics.find_perceptual(notes.append) is None
+    metrics._perceptual.cache_clear()
 
     class Unreachable:
-        def __init__(self, **settings: object):
+        def __init__(self, net_type: str, **settings: object):
+            attempts.append(net_type)
             raise OSError("<urlopen error [Errno -2] Name or service not known>\nmore")
 
     module = ModuleType("lpip")
@@ -166,6 +178,8 @@ def test_without_its_libraries_or_weights_lpips_is_left_out_in_one_line(monkeypa
     monkeypatch.setattr(metrics.importlib, "import_module", lambda name: module)
     assert metrics.find_perceptual(notes.append) is None
     assert len(notes) == 2
+    assert metrics.find_perceptual(lambda text: None) is None
+    assert attempts == ["alex"], "without a network, each attempt waits for it"
     assert "nerfcli[lpips]" in notes[0]
     assert notes[1].endswith("weights could not be loaded (<urlopen error [Errno -2] Name or service not known>)")
     assert "\n" not in "".join(notes)

@@ -4,6 +4,7 @@ Colours are sRGB in [0, 1], as float or rounded to 8 bits. Pixels that do not co
 left out entirely: from PSNR pixel by pixel, from SSIM with every window that contains one.
 """
 
+import functools
 import importlib
 import socket
 import statistics
@@ -184,19 +185,27 @@ def find_perceptual(notify: Callable[[str], None]) -> Perceptual | None:
     Source: Zhang et al. 2018, The unreasonable effectiveness of deep features as a perceptual metric,
     arXiv:1801.03924; computed by torchmetrics.
     """
+    found = _perceptual()
+    if isinstance(found, str):
+        notify(f"LPIPS is not available{found}")
+        return None
+    return found
+
+
+@functools.cache  # without a network, a second attempt would wait for it again
+def _perceptual() -> Perceptual | str:
+    """Return the perceptual distance, or why it is not available."""
     try:
         importlib.import_module("torchvision")
         metric = importlib.import_module("torchmetrics.image.lpip").LearnedPerceptualImagePatchSimilarity
     # A torchvision that was built for another torch fails with a RuntimeError or OSError.
     except (ImportError, RuntimeError, OSError) as error:
-        notify(f"LPIPS is not available ({_first_line(error)}); install it with {INSTALL}")
-        return None
+        return f" ({_first_line(error)}); install it with {INSTALL}"
     try:
         with _socket_timeout():
             network = metric(net_type="alex", normalize=True)
     except (RuntimeError, OSError) as error:  # no network (URLError is an OSError), or a truncated file
-        notify(f"LPIPS is not available: its weights could not be loaded ({_first_line(error)})")
-        return None
+        return f": its weights could not be loaded ({_first_line(error)})"
 
     def measure(picture: np.ndarray, photo: np.ndarray) -> float:
         pair = [torch.from_numpy(np.ascontiguousarray(p, dtype=np.float32)) for p in (picture, photo)]
