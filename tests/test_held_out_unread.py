@@ -162,4 +162,5 @@ def test_held_out_photos_that_are_gone_do_not_undo_a_training(capture, tmp_path)
     reported = fit(loaded, tmp_path / "run", replace(settings("default", Components()), steps=4))
     assert (tmp_path / "run" / FIELD).exists()
     assert any("PSNR on held-out photos could not be measured" in line for line in reported)
+    assert not (tmp_path / "run" / checkpoints.WAYPOINTS_FOLDER).exists()
     assert "heldout_psnr" not in read_log(tmp_path / "run")[-1]

@@ -348,6 +348,12 @@ def test_too_few_steps_are_not_spent():
     assert (chosen.components, chosen.decisions, scripted.requested) == (Components(), (), [])
 
 
+def test_a_training_ends_even_if_its_preparation_took_all_of_its_budget():
+    budget = Budget(10.0, None)
+    assert [budget.progress(0, 12.0, before=12.0), budget.progress(9, 13.0, before=12.0)] == [0.0, 1.0]
+    assert budget.progress(5, 6.0, before=2.0) == 0.5
+
+
 def test_short_trainings_are_not_searched_for():
     assert not Budget(9.0, None).allows_trials
     assert Budget(60.0, None).allows_trials

@@ -423,7 +423,9 @@ def test_photos_without_alpha_train_an_unbounded_scene(spheres, tmp_path):
     [
         ({"budget_seconds": None, "steps": None}, "no stopping criterion"),
         ({"budget_seconds": -1.0}, "budget must be positive"),
+        ({"budget_seconds": 0.0, "steps": 10}, "budget must be positive"),
         ({"steps": -3}, "budget must be positive"),
+        ({"budget_seconds": None, "steps": 0}, "budget must be positive"),
         ({"downscale": 3}, "invalid downscale factor 3"),
         ({"field": "gaussians"}, "unknown type of field: 'gaussians'"),
     ],

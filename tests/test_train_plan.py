@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from conftest import SPHERES
@@ -11,23 +12,41 @@ from typer.testing import CliRunner
 from nerfcli.captures.capture import Capture
 from nerfcli.cli import app
 from nerfcli.errors import OUT_OF_MEMORY, UserError
+from nerfcli.field.hash_field import HashFieldSettings
+from nerfcli.field.kinds import KINDS, chosen_size, parameter_bytes
 from nerfcli.machine import Resources
+from nerfcli.training import loop
 from nerfcli.training.loop import train
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import SHOWN, THRESHOLD
+from nerfcli.training.storage import field_bytes
 from nerfcli.workflows.train import plan_training
 
 STEPS = TrainSettings(budget_seconds=None, steps=250)
 
 
-def test_disk_space_covers_a_run_and_the_state_that_is_replaced(spheres: Capture, tmp_path: Path) -> None:
-    settings = replace(STEPS, steps=1, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)
-    run = tmp_path / "run"
+def test_disk_space_covers_a_run_its_waypoints_and_the_state_that_is_replaced(
+    spheres: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = replace(STEPS, steps=4, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)
+    run, measured, measure = tmp_path / "run", list[int](), loop.measure_waypoints
+
+    def weighed(*arguments: Any, **named: Any) -> None:
+        measured.append(sum(file.stat().st_size for file in run.rglob("*") if file.is_file()))
+        measure(*arguments, **named)
+
+    monkeypatch.setattr(loop, "measure_waypoints", weighed)
     train(spheres, run, settings, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
-    files = {file.name: file.stat().st_size for file in run.iterdir()}
-    largest = sum(files.values()) + files["state.safetensors"]
     planned = plan_training(SPHERES, settings).disk_bytes
-    assert planned == pytest.approx(largest, rel=0.1)
+    assert planned == pytest.approx(measured[0] + (run / "state.safetensors").stat().st_size, rel=0.1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_size_of_a_field_is_that_which_it_gets(kind: str) -> None:
+    rows = 16
+    size = chosen_size(kind, hash_grid=HashFieldSettings("l2", log2_rows=rows), footprint=1e-4, memory_bytes=None)
+    planned = field_bytes(replace(STEPS, field=kind, log2_rows=rows))
+    assert planned == pytest.approx(parameter_bytes(size), rel=0.15)  # sizes are whole levels
 
 
 def test_photos_that_memory_cannot_hold_are_on_the_disk() -> None:

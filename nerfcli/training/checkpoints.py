@@ -171,8 +171,8 @@ class Checkpoints:
         extent = self._inputs.extent.to_json()
         description |= {"format": STATE_FORMAT, "extent": extent, "totals": vars(self._totals)}
         writing = [lambda: self._write_field(model), lambda: save_tensors(self._run / STATE, tensors, description)]
-        # The process may be killed between the two. The state is all that resuming needs and must never be ahead of the
-        # field. The first time it is written first, so that no field exists that can neither be resumed nor replaced.
+        # The process may be killed between the two. The field is written first, so that the state is never ahead of it;
+        # except for the first time, as a field without a state could be neither resumed nor replaced.
         for write in writing if (self._run / FIELD).exists() else reversed(writing):
             write()
 
@@ -262,6 +262,7 @@ def measure_waypoints(
             pixels = HeldoutPixels(pool)
         except UserError as error:
             notify(f"training is complete, but PSNR on held-out photos could not be measured: {error}")
+            forget_waypoints(run)
             return
         measured = {}
         for step in steps:

@@ -109,7 +109,7 @@ def train(
 
     Raises:
         UserError: too little memory, unreadable photos, numbers that became non-finite, nothing to resume, a folder
-            that cannot be written, or another process that has ended; a checkpoint has then been written.
+            that cannot be written, or, after a checkpoint has been written, another process that has ended.
         KeyboardInterrupt: passed on after a checkpoint has been written.
     """
     use_threads(settings.threads)

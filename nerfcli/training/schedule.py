@@ -63,6 +63,10 @@ DAMPING_PROGRESS, DAMPINGS = (0.2, 0.8), (1.0, 0.1)
 HOLDING_PROGRESS, HOLDINGS = (0.2, 0.5), (1e-3, 0.05)
 
 
+# At least this fraction of a time budget is for steps, however long the preparation took.
+LEAST_FOR_STEPS = 0.1
+
+
 @dataclass(frozen=True)
 class Budget:
     """Seconds and steps that may be used; None for no limit."""
@@ -83,8 +87,9 @@ class Budget:
             seconds: used so far.
             before: seconds of these that were used before the first step.
         """
-        left = self.seconds - before if self.seconds else 0.0
-        by_time = (seconds - before) / left if left > 0 else 0.0
+        by_time = 0.0
+        if self.seconds:
+            by_time = (seconds - before) / max(self.seconds - before, LEAST_FOR_STEPS * self.seconds)
         by_steps = step / self.steps if self.steps else 0.0
         return min(1.0, max(by_time, by_steps))
 
@@ -159,7 +164,8 @@ class Schedule:
     Args:
         settings: learning rates, samples, and components.
         parallax: of the capture, see `Extent`; below 1 with a narrow baseline.
-        cameras_from: the progress from which they do, for a training that goes on from one with fixed cameras.
+        cameras_from: the progress at which cameras start to learn, for a training that goes on from one with fixed
+            cameras.
         has_large_table: whether the field is one of long trainings.
         closing_steps: the steps after which open cells have the last threshold.
     """
@@ -221,9 +227,8 @@ class Schedule:
 NOTES = (
     f"before the first step: stereo matching for up to {100 * STEREO_FRACTION:.0f} % of the budget, trials for up to "
     f"{100 * SEARCH_FRACTION:.0f} %",
-    "points, sky and roughness count where the components include points and a background; with log, points have a log "
-    "likelihood",
-    "cameras move where they are refined; then finer levels learn later",
+    "the losses on points, sky and roughness apply only if these components are on; log marks a log-likelihood loss",
+    "if cameras are refined, the finer levels start to learn later",
 )
 
 

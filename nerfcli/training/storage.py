@@ -18,6 +18,7 @@ import torch
 from nerfcli.atomic import cannot_write
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import OUT_OF_MEMORY, UserError
+from nerfcli.field.kinds import NETWORK_BYTES, VOXEL_BYTES
 from nerfcli.machine import resident_bytes
 from nerfcli.training.runs.settings import TrainSettings
 
@@ -61,7 +62,8 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
 def field_bytes(settings: TrainSettings) -> int:
     """Estimate the memory of one copy of a field's parameters."""
     hash_rows = 8 * 16 * 2**settings.chosen_log2_rows  # 8 levels of 4 float32
-    return settings.field_memory_bytes or (hash_rows if settings.field == "hash" else 64 * 2**20)
+    usual = {"hash": hash_rows, "voxels": VOXEL_BYTES, "mlp": NETWORK_BYTES}
+    return settings.field_memory_bytes or usual[settings.field]
 
 
 class InMemory:

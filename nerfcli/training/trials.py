@@ -91,9 +91,9 @@ class Diagnostics:
     Args:
         log_gains: (photos, 3) logarithm of the ratio of each photo to its rendering, in linear light; their mean is 0.
         exposure_spread: standard deviation of the photos' log brightness, without the noise of its estimates.
-        far_share: fraction of the pixels whose light comes mostly from so far away that it shows no parallax.
+        far_fraction: fraction of the pixels whose light comes mostly from so far away that it shows no parallax.
         sky_psnr: PSNR of these pixels predicted by one colour, and by a colour for each direction; see
-            `sky.explained_by_direction`.
+            `explained_by_direction`.
     """
 
     log_gains: Tensor

@@ -31,7 +31,7 @@ from nerfcli.training.runs.components import choose
 from nerfcli.training.runs.files import CONFIG, LOCK, METRICS, STATE
 from nerfcli.training.runs.run import Run, split_hash
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
-from nerfcli.training.schedule import Schedule, StepPlan
+from nerfcli.training.schedule import WAYPOINTS, Schedule, StepPlan
 from nerfcli.training.storage import InFiles, field_bytes, needs_of, storage_for
 
 # Width of a pixel at the centre of the scene, in units of the training frame, for a field whose photos are not read.
@@ -298,8 +298,9 @@ def plan_training(
         downscale=factor,
         pixels=sum((f.camera.width // factor) * (f.camera.height // factor) for f in loaded.train_frames),
         memory_bytes=min(total, limit) if limit else total,
-        # The field, the state with both moments of the optimiser, and the previous state until the next is written.
-        disk_bytes=(1 + 3 + 3) * field_bytes(settings) + in_files,
+        # The field and its waypoints, the state with both moments of the optimiser, and the previous state until the
+        # next is written.
+        disk_bytes=(1 + len(WAYPOINTS) + 3 + 3) * field_bytes(settings) + in_files,
         seconds=settings.budget_seconds,
         steps=settings.steps,
         schedule=tuple(_likely_schedule(settings).plans()),

@@ -51,7 +51,7 @@ class TrainSettings:
         components: components of the model and of its loss.
         field: kind of field, one of `kinds.KINDS`.
         field_memory_bytes: memory limit of the field's numbers; None for the default of the kind, see
-            `sizes.chosen_size`.
+            `kinds.chosen_size`.
         model: "default" uses the components as given, "auto" selects those that are not `fixed` for the scene, see
             `selection`.
         fixed: names of components that the user has chosen.
@@ -86,7 +86,7 @@ class TrainSettings:
             raise UserError(
                 "no stopping criterion: neither --budget nor --steps is given", "give --budget, --steps, or both"
             )
-        if (self.budget_seconds or 1) <= 0 or (self.steps or 1) <= 0:
+        if any(limit is not None and limit <= 0 for limit in (self.budget_seconds, self.steps)):
             raise UserError("the training budget must be positive", "for example --budget 2m or --steps 2000")
         if self.downscale not in (None, *DOWNSCALES):
             raise UserError(f"invalid downscale factor {self.downscale}", "choose auto, 1, 2, 4 or 8")
