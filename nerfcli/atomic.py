@@ -150,8 +150,10 @@ def read_json(path: Path, *, needed: tuple[str, ...], hint: str) -> dict[str, An
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise UserError(f"cannot read {path}: {error}", hint) from error
-    if not isinstance(content, dict) or any(key not in content for key in needed):
-        raise UserError(f"cannot read {path}: {', '.join(needed)} is missing", hint)
+    if not isinstance(content, dict):
+        raise UserError(f"cannot read {path}: it is not a JSON object", hint)
+    if missing := [key for key in needed if key not in content]:
+        raise UserError(f"cannot read {path}: it has no {', '.join(missing)}", hint)
     return content
 
 

@@ -116,6 +116,9 @@ def test_json_of_ours_that_is_damaged_is_reported(content, tmp_path):
     with pytest.raises(UserError, match=r"cannot read .*metrics\.json"):
         read_json(path, needed=("mean",), hint="measure again")
     write_json(path, {"mean": 1})
+    with pytest.raises(UserError, match=r"metrics\.json: it has no images, seconds$"):
+        read_json(path, needed=("mean", "images", "seconds"), hint="measure again")
+    write_json(path, {"mean": 1})
     assert read_json(path, needed=("mean",), hint="measure again") == {"mean": 1}
 
 

@@ -147,8 +147,8 @@ def test_cameras_start_from_exif_only_where_it_holds():
     assert [camera.has_prior_focal_length for camera in cameras] == [True, False, False]
     assert [camera.mean_focal_length() for camera in cameras] == pytest.approx([7600, 7600 * 640 / 3648, 768])
     assert grouped.notes[1:] == (
-        "EXIF's focal length is not used for 1.jpg: EXIF is for 5472x3648 pixels, but the file has 640x640: "
-        "cropped after the shot",
+        "EXIF's focal length is only a starting value for 1.jpg: EXIF is for 5472x3648 pixels, but the file has "
+        "640x640: cropped after the shot",
     )
     bare = [camera_of_group(group.without_exif()) for group in grouped.groups]
     assert [camera.mean_focal_length() for camera in bare] == pytest.approx([1.2 * 5472, 768, 768])
@@ -182,8 +182,10 @@ def test_doubts_about_exif_are_one_note_for_a_reason_and_few_in_all():
     photos = [photo(f"{n:02}.jpg", exif, size=(exif.width, exif.height)) for n, exif in enumerate(crops)]
     _, *doubts = group_photos(Photos(Path(), tuple(photos), {}), model="auto").notes
     assert len(doubts) == 5
-    assert doubts[0].startswith("EXIF's focal length is not used for 00.jpg and 1 more photo: EXIF is for 5472x3648")
-    assert doubts[-1] == "nor for 6 more photos, for reasons like these"
+    assert doubts[0].startswith(
+        "EXIF's focal length is only a starting value for 00.jpg and 1 more photo: EXIF is for 5472x3648"
+    )
+    assert doubts[-1] == "and for 6 more photos, for reasons like these"
 
 
 def test_crops_of_other_pictures_are_other_cameras_and_autofocus_is_not():

@@ -177,6 +177,15 @@ def test_the_page_shows_the_numbers_and_embeds_the_pictures(seen):
     assert all(layer["uri"].startswith("data:image/jpeg;base64,") for view in layers for layer in view)
 
 
+def test_a_run_that_shares_photos_with_two_others_joins_their_captures():
+    tests = [("a.png",), ("b.png",), ("c.png",), ("b.png", "a.png")]
+    runs = [
+        facts(str(number), frames=RunCameras((), tuple(camera_at(name, (0, 0, -2)) for name in names)))
+        for number, names in enumerate(tests)
+    ]
+    assert captures_of(runs) == [[0, 1, 3], [2]]
+
+
 def two_captures(seen: tuple[list[HeldOutRenderings], np.ndarray]) -> str:
     """A page about two runs of one capture and one of another, whose photo has the same name."""
     look, _ = seen

@@ -168,7 +168,7 @@ def test_export_refines_once_and_writes_every_format(run: Path) -> None:
     budget = duration(SMALL.budget_seconds)
     assert f"depths of the training photos, {budget} of refinement left" in details
     assert f"pictures of the field, {budget} of refinement left" in details
-    assert re.fullmatch(r"refines \d+ splats, 0 s left", details[-1])
+    assert re.fullmatch(r"refining \d+ splats, 0 s left", details[-1])
     assert ply == run.with_name("spheres-run-splats.ply")
     assert any("training photos: field" in line for line in notes)
     state = (run / SPLATS).read_bytes()
@@ -189,13 +189,21 @@ def test_what_splats_cannot_do_is_refused(run: Path) -> None:
         nerfcli.export_run(run, Output(run.with_name("d.html")), to="splats", splats=replace(SMALL, frame="scene"))
     ply = run.with_name("spheres-run-splats.ply")
     for arguments, words in (
-        (["render", ply, "--cameras", run / "cameras.json", "--cameras-only"], "it works with a run"),
-        (["render", ply, "--cameras", run / "cameras.json", "--splats", ply], "it works with a run"),
+        (["render", ply, "--cameras", run / "cameras.json", "--cameras-only"], "--cameras-only works with a run"),
+        (["render", ply, "--cameras", run / "cameras.json", "--splats", ply], "--splats works with a run"),
         (["evaluate", run, "--splats", run / "none.ply"], "there is no"),
     ):
         refused = command(*arguments)
         assert refused.exit_code == 2
         assert words in " ".join(refused.stderr.split())
+
+
+def test_a_refused_path_does_not_end_a_batch(run: Path, tmp_path: Path) -> None:
+    ply = run.with_name("spheres-run-splats.ply")
+    done = command("render", "-", "--cameras-only", "-o", tmp_path, stdin=f"{ply}\n{run}\n")
+    assert done.exit_code == 2
+    assert "--cameras-only works with a run" in " ".join(done.stderr.split())
+    assert [Path(line).is_dir() for line in done.stdout.splitlines()] == [True]
 
 
 def test_resume_goes_on_and_other_settings_begin_again(run: Path) -> None:
@@ -206,7 +214,7 @@ def test_resume_goes_on_and_other_settings_begin_again(run: Path) -> None:
     after = load_splat_state(run / SPLATS)
     assert after.refinement.steps > before.refinement.steps
     assert len(after.refinement.rows) == len(before.refinement.rows)
-    with pytest.raises(UserError, match="no splats of this field"):
+    with pytest.raises(UserError, match="are missing, or were made from another field"):
         nerfcli.export_run(run, again, to="splats", splats=replace(longer, degree=2))
     nerfcli.export_run(run, again, to="splats", splats=replace(SMALL, degree=0))
     assert load_splat_state(run / SPLATS).degree == 0

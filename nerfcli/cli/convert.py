@@ -32,8 +32,9 @@ FORMATS_WRITTEN = (
 PROGRAMS = {"nerfstudio": "transforms", "instant-ngp": "transforms"}
 # Names of files that do not identify the capture.
 COMMON_STEMS = ("transforms", "reconstruction", "bundle", "poses_bounds", "scene", "cameras", "images")
-# Number of best hypotheses per question in the table of --detect.
 PIXEL_CENTRES = {"0.5": 0.5, "0": 0.0}
+# Number of best hypotheses per question in the table of --detect.
+_MOST_HYPOTHESES = 3
 _AXES = "opencv (= rdf), opengl (= rub), llff (= drb), pytorch3d (= luf), ros (= flu), or three such letters"
 
 Source = Annotated[
@@ -274,7 +275,7 @@ def _table(found: "Detection") -> list[str]:
     for question in found.questions:
         lines.append(f"  {question.name}")
         for place, answer in enumerate(question.answers):
-            if place < 3 or answer.as_format_says:
+            if place < _MOST_HYPOTHESES or answer.as_format_says:
                 verdict = _verdict(question) if place == 0 else ""
                 error = "behind" if answer.median_px == float("inf") else f"{answer.median_px:.3f} px"
                 inliers = f"{100 * answer.inlier_fraction:>7.1f} %"

@@ -95,7 +95,7 @@ def check_gate(findings: Sequence[Finding], require: str | None) -> None:
     """Raise if a finding is worse than required.
 
     Raises:
-        UserError: one is.
+        UserError: a finding is worse.
     """
     if require is None:
         return

@@ -160,11 +160,12 @@ def export(
 
 def _refuse_unused(to: str, surface: SurfaceOptions, splats: SplatOptions) -> None:
     unused = {
+        "--box": (surface.box is not None and to == "splats", "pages, meshes and points"),
         "--faces": (surface.faces is not None and to != "mesh", "meshes"),
         "--voxel-size": (surface.voxel_size is not None and to not in ("mesh", "points"), "meshes and points"),
     }
     for name, value in vars(splats).items():
-        unused[f"--{name}"] = (to != "splats" and value not in (None, False), "splats")
+        unused[f"--{name}"] = (to != "splats" and value is not None and value is not False, "splats")
     refuse_unused(unused, "it is for {}; remove it")
 
 

@@ -32,7 +32,9 @@ class ViewOptions:
     count: Annotated[int, typer.Option(help="Number of views of orbit, ellipse, spiral and interpolate.", min=2)] = 60
     max_size: Annotated[
         int | None,
-        typer.Option(help="Maximum longer side of the pictures, in pixels.  [default: training resolution]", min=8),
+        typer.Option(
+            help="Maximum length of the longer side of pictures, in pixels.  [default: training resolution]", min=8
+        ),
     ] = None
     width: Annotated[
         int | None,
@@ -57,7 +59,7 @@ class ViewOptions:
     frames: Annotated[
         str | None,
         typer.Option(
-            help="START:STOP[:STEP], counted from 0, or K/N, every N-th from K: render only these; no videos."
+            help="Render only views START:STOP[:STEP] (counted from 0) or part K/N (every N-th from K); no videos."
         ),
     ] = None
     cameras_only: Annotated[
@@ -101,7 +103,10 @@ class DepthOptions:
 
     depth: Annotated[
         str,
-        typer.Option(help="Definition of depth: conditional, moment, background, max-weight, median or quantile:0.05."),
+        typer.Option(
+            help="Definition of depth: conditional, moment, background, max-weight, median or quantile:Q, "
+            "such as quantile:0.05."
+        ),
     ] = "conditional"
     depth_axis: Annotated[
         str | None,
@@ -247,9 +252,7 @@ class FileOptions:
         from nerfcli.render.files.film import ENCODERS, GIF_FASTEST_FPS
         from nerfcli.render.job import VideoSettings
 
-        chosen = tuple(dict.fromkeys((self.video_format or "mp4").split(",")))
-        for name in chosen:
-            one_of(name, ENCODERS, "--video-format")
+        chosen = some_of(self.video_format or "mp4", ENCODERS, "--video-format")
         if "gif" in chosen and fps > GIF_FASTEST_FPS:
             raise typer.BadParameter(
                 f"{fps:g}; a gif plays at {GIF_FASTEST_FPS:g} frames per second at most", param_hint="--fps"
@@ -341,9 +344,11 @@ def render(
 
 
 def _refuse_of_runs(path: Path, options: dict[str, bool]) -> None:
+    from nerfcli.errors import UserError
+
     for option, is_given in options.items():
         if is_given:
-            raise typer.BadParameter(f"it works with a run, not with {path}; remove it", param_hint=option)
+            raise UserError(f"{option} works with a run, not with {path}", "remove it", exit_code=2)
 
 
 def _refuse_unused(seen: ViewOptions, depths: DepthOptions, files: FileOptions, outputs: tuple[str, ...]) -> None:

@@ -21,7 +21,7 @@ DEFAULT_BUDGET = "2m"
 
 @dataclass(frozen=True)
 class Fit:
-    """What is trained, for how long, and from where on."""
+    """What to train, for how long, and from where on."""
 
     budget: Annotated[
         str | None, typer.Option(help="Training time: 90s, 5m, 1h; 90 is 90 s.  [default: 2m, or none with --steps]")
@@ -162,7 +162,9 @@ def train(
     from nerfcli.workflows.train import plan_training, train_scene
 
     if is_one_of_several() and (fit.dry_run or scene == STDIN):
-        raise UserError("processes of torchrun train one field of photos", "use this command without torchrun", 2)
+        raise UserError(
+            "torchrun works only with one scene, and without --dry-run", "use this command without torchrun", 2
+        )
     console = Console(quiet=printing.quiet or not is_first(), json_lines=printing.json)
     settings = fit.settings(training)
     how = {"holdout": options.holdout_rule(fit.holdout), "resources": fit.resources(training)}

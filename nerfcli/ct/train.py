@@ -93,7 +93,7 @@ def train_scan(
             )
     elif _holds_something(run) and not (output.overwrite and is_reconstruction(run)):
         raise UserError(f"{run} exists and is not a reconstruction", "choose another folder with --output")
-    with exclusive(run / LOCK, f"another nerfcli ct train is writing {run}"):
+    with exclusive(run / LOCK, f"nerfcli ct train is writing {run}"):
         clear_leftovers(run)
         if loaded.kind != "line_integral" and loaded.photons_per_value is None:
             reporter.warn("photons per detector value not given: estimated from the noise of neighbouring pixels")

@@ -96,7 +96,7 @@ def _report_missing(capture: Capture, reporter: Reporter) -> None:
     """Name the photos that are not on disk.
 
     Raises:
-        UserError: none is.
+        UserError: none is on disk.
     """
     missing = [*(frame.name for frame in capture.frames if not frame.has_photo), *capture.missing]
     count = len(capture.missing) + len(capture.frames)

@@ -69,6 +69,8 @@ def export_run(
     Raises:
         UserError: the run does not exist, the output exists, or the field cannot be exported this way.
     """
+    if to not in TARGETS:
+        raise UserError(f"unknown kind of export: {to!r}", f"choose {', '.join(TARGETS)}", exit_code=2)
     trained, torch_device = Run(Path(run)), resources.torch_device
     path = output.at(default_target(trained.path, to))
     suffixes = TARGETS[to]
@@ -134,8 +136,8 @@ _DEPTHS = 0.7
 def _export_mesh(run: Run, model: Model, path: Path, *, settings: SurfaceSettings, reporter: Reporter) -> None:
     """Write the surface as .ply, .glb or .obj."""
     views, grid = _seen(run, model, settings, reporter)
-    fused = fuse(views, grid, on_progress=reporter.part(_DEPTHS, 0.9, "fuses"))
-    mesh = without_small_pieces(surface_of(fused, on_progress=reporter.part(0.9, 0.95, "marches")))
+    fused = fuse(views, grid, on_progress=reporter.part(_DEPTHS, 0.9, "fusing depths"))
+    mesh = without_small_pieces(surface_of(fused, on_progress=reporter.part(0.9, 0.95, "extracting the surface")))
     if not len(mesh.faces):
         raise UserError("no surface found in the box", "use another --box, a larger --voxel-size, or train longer")
     found = len(mesh.faces)
@@ -159,7 +161,7 @@ def _export_mesh(run: Run, model: Model, path: Path, *, settings: SurfaceSetting
 def _export_points(run: Run, model: Model, path: Path, *, settings: SurfaceSettings, reporter: Reporter) -> None:
     """Write points of the surfaces as .ply."""
     views, grid = _seen(run, model, settings, reporter)
-    points = agreed_points(views, grid, on_progress=reporter.part(_DEPTHS, 1.0, "compares"))
+    points = agreed_points(views, grid, on_progress=reporter.part(_DEPTHS, 1.0, "comparing views"))
     if not len(points.places):
         raise UserError("no two photos see the same point in the box", "use another --box, or train longer")
     columns = dict(zip("xyz", points.places.T, strict=True))
@@ -179,7 +181,7 @@ def _seen(run: Run, model: Model, settings: SurfaceSettings, reporter: Reporter)
     chosen = spread_frames(run.cameras.train, MOST_VIEWS)
     box = settings.box or scene_box(model, run.cameras.train)
     views = depth_views(
-        model, chosen, max_size=settings.max_size, on_progress=reporter.part(0.02, _DEPTHS, "renders depths")
+        model, chosen, max_size=settings.max_size, on_progress=reporter.part(0.02, _DEPTHS, "rendering depths")
     )
     return views, Grid.over(box, settings.voxel_size or automatic_voxel(views, box))
 

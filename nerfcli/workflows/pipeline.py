@@ -1,4 +1,4 @@
-"""All stages on one page: poses, training, evaluation, splats, pictures, report."""
+"""All stages in one call: poses, training, evaluation, splats, pictures, report."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -123,7 +123,8 @@ def _estimated(
     def on_stage(stage: str, done: int, total: int) -> None:
         fraction, left = (0.0, None) if time_estimate is None else time_estimate.update(stage, done, total)
         about = "" if left is None else f", about {duration(left)} left"
-        reporter.progress(fraction, f"({done} of {total} {_STAGES[stage]}{about})")
+        amount = f"{done}" if stage == "matches" else f"{done} of {total}"
+        reporter.progress(fraction, f"({amount} {_STAGES[stage]}{about})")
 
     report = structure_from_motion.estimate_poses(
         folder,

@@ -54,7 +54,7 @@ class SplatSettings:
         budget_seconds: of refinement, wall time.
         degree: of the harmonics of colours, 0 to 3.
         frame: "viewer", whose y points down, or "scene".
-        resume: refine the splats that the run already has for another `budget_seconds`.
+        resume: refine the splats that the run has further, to `budget_seconds` in total.
     """
 
     count: int | None = None
@@ -166,7 +166,7 @@ def run_splats(run: Run, model: Model, *, settings: SplatSettings, reporter: Rep
         left = duration(settings.budget_seconds * max(0.0, 1.0 - fraction))
         reporter.progress(
             _START + (1.0 - _START) * (fraction - began) / (1.0 - began),
-            f"refines {len(splats.refinement.rows)} splats, {left} left",
+            f"refining {len(splats.refinement.rows)} splats, {left} left",
         )
 
     with deferred_interrupts() as interrupts:
@@ -205,7 +205,8 @@ def _kept(run: Run, model: Model, settings: SplatSettings) -> RunSplats | None:
     )
     if settings.resume and not same:
         raise UserError(
-            f"{run.path} has no splats of this field, --count and --sh to refine further", "leave out --resume"
+            f"the splats in {run.path} are missing, or were made from another field, --count or --sh",
+            "leave out --resume",
         )
     if not same or splats is None:
         return None

@@ -107,17 +107,15 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
     sets, factor = run.cameras, run.config.downscale
     keyframes = sets.train
     if through is not None:
-        keyframes = frames_named([*sets.train, *sets.test], through.split(","))
+        keyframes = frames_named([*sets.train, *sets.test], [name.strip() for name in through.split(",")])
     if cameras in ("test", "train"):
         chosen = sets.test if cameras == "test" else sets.train
         if not chosen:
             raise UserError(f"{run.path} has no {cameras} cameras", f"use --cameras train, {', '.join(PATHS)}")
     elif cameras == "interpolate":
         chosen = paths.interpolate(keyframes, count=views.count)
-    elif cameras == "ellipse":
-        chosen = paths.ellipse(keyframes, count=views.count, depth_hint=depth_hint)
     elif cameras in PATHS:
-        path = {"orbit": paths.orbit, "spiral": paths.spiral}[cameras]
+        path = {"ellipse": paths.ellipse, "orbit": paths.orbit, "spiral": paths.spiral}[cameras]
         chosen = path(keyframes, count=views.count, depth_hint=depth_hint)
     else:
         return frames_of_file(views)

@@ -100,13 +100,13 @@ def captures_of(runs: Sequence[RunFacts]) -> list[list[int]]:
     captures: list[tuple[set[str], list[int]]] = []
     for index, run in enumerate(runs):
         photos = {str(frame.image.resolve()) if frame.image else frame.name for frame in run.frames.test}
-        found = next((capture for capture in captures if capture[0] & photos), None)
-        if found is None:
-            captures.append((photos, [index]))
-        else:
-            found[0].update(photos)
-            found[1].append(index)
-    return [indices for _, indices in captures]
+        indices = [index]
+        for capture in [capture for capture in captures if capture[0] & photos]:
+            captures.remove(capture)
+            photos |= capture[0]
+            indices += capture[1]
+        captures.append((photos, sorted(indices)))
+    return sorted(indices for _, indices in captures)
 
 
 def scenes_of(runs: Sequence[RunFacts]) -> list[str]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
+from nerfcli.errors import listed
 from nerfcli.evaluate.protocol import Novelty, RunMetrics
 from nerfcli.evaluate.report.run_facts import RunFacts, captures_of
 from nerfcli.pages.page import Table
@@ -75,7 +76,7 @@ def last_logged(
 
 def _size(run: RunFacts) -> str:
     cameras = {(frame.camera.width, frame.camera.height) for frame in (*run.frames.train, *run.frames.test)}
-    return ", ".join(f"{width} x {height}" for width, height in sorted(cameras)[:4])
+    return listed([f"{width} x {height}" for width, height in sorted(cameras)], most=4)
 
 
 def _unit(run: RunFacts) -> str:
