@@ -68,7 +68,7 @@ def count() -> int:
 
 
 def own(rows: Tensor, total: int) -> Tensor:
-    """Return this process's part of rows, which are the last ones of a total."""
+    """Return this process's share of `rows`, the last `len(rows)` of `total` rows."""
     if count() == 1:
         return rows
     return rows[(rank() - (total - len(rows))) % count() :: count()].contiguous()

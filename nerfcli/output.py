@@ -44,7 +44,7 @@ class Output:
         """Refuse files if one of them is there and may not be replaced.
 
         Raises:
-            UserError: one is.
+            UserError: a file is there and may not be replaced.
         """
         there = [path for path in paths if path.exists()]
         if there and not self.overwrite:
@@ -54,7 +54,7 @@ class Output:
         """Refuse a file that cannot be written or is there and may not be replaced; create its folder.
 
         Raises:
-            UserError: it is.
+            UserError: it cannot be written, or is there and may not be replaced.
         """
         if path.is_dir():
             raise UserError(f"{path} is a folder", "give a file name with -o")

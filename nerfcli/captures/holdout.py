@@ -1,7 +1,7 @@
 """Held-out split: every n-th photo by name, a block of neighbours, or a list in a file.
 
-every:8       index 0, 8, 16, ... of the sorted names: each has training neighbours on both sides
-block:0.15    the middle 15 % of the sorted names: a gap in the capture without training neighbours inside
+every:8       index 0, 8, 16, ... in alphabetical order, as in published tables: photos with training neighbours
+block:0.15    the middle 15 % in the order of the numbers in the names: a gap without training neighbours
 FILE          the names in a text file, one per line
 
 Photos with the same file name in different folders, such as left/0001.png and right/0001.png, were taken at the same

@@ -261,7 +261,7 @@ class RenderJob:
     def is_kept_in(self, folder: Path, output: Output) -> bool:
         """Return whether the finished folder holds this job, pictures and presentation, and stays.
 
-        It is also False if the folder holds the same pictures and nothing would be replaced, as when videos are added.
+        Also False if it holds the same pictures, and only videos or levels have to be added.
 
         Raises:
             UserError: it holds something else that may not be replaced.

@@ -214,7 +214,7 @@ def refuse_non_finite(rows: np.ndarray) -> None:
     """Raise if a number is not finite.
 
     Raises:
-        UserError: one is.
+        UserError: a number is NaN or infinite.
     """
     bad = ~np.isfinite(rows).all(axis=1)
     if bad.any():

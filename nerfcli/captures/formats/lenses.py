@@ -136,7 +136,7 @@ class Terms(NamedTuple):
 
 
 class Fits:
-    """Makes the cameras of a capture, and remembers how well their terms were fitted by others."""
+    """Makes the cameras of a capture, and remembers how far each approximated lens is off."""
 
     def __init__(self) -> None:
         self._off: dict[tuple[str, str], list[float]] = {}

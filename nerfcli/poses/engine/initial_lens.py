@@ -1,6 +1,6 @@
 """Initial lenses for mapping, from verified pairs of photos, before any photo is placed.
 
-Focal lengths are estimated where EXIF has no reliable one; letters there: p, q are the pixels of a match from the
+Focal lengths are estimated where EXIF has no reliable one. Notation: p, q are the pixels of a match from the
 centre of the picture, in units of the focal length, with 1 appended; E = U diag(1, 1, 0) V the essential matrix of a
 pair, q^T E p = 0.
 

@@ -143,9 +143,9 @@ def _doubts(doubted: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     notes = []
     for doubt, names in list(doubted.items())[:_MOST_LISTED]:
         which = names[0] if len(names) == 1 else f"{names[0]} and {several(len(names) - 1, 'more photo')}"
-        notes.append(f"EXIF's focal length is not used for {which}: {doubt}")
+        notes.append(f"EXIF's focal length is only a starting value for {which}: {doubt}")
     rest = sum(len(names) for names in list(doubted.values())[_MOST_LISTED:])
-    return (*notes, f"nor for {several(rest, 'more photo')}, for reasons like these") if rest else tuple(notes)
+    return (*notes, f"and for {several(rest, 'more photo')}, for reasons like these") if rest else tuple(notes)
 
 
 def _summary(groups: Sequence[CameraGroup]) -> str:
