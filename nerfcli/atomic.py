@@ -49,6 +49,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     Raises:
         UserError: as for `atomic_path`.
     """
+    path = path.absolute()  # "." has no name
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
     with _write_errors_explained(path):
         try:

@@ -337,7 +337,7 @@ def test_maps_of_record3d_are_unpacked_with_lzfse(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="compressed with LZFSE"):
         read_sensor_depth(SensorDepth(path), tmp_path / "0.jpg")
     (tmp_path / "0.conf").write_bytes(zlib.compress(np.full((20, 30), 1, np.uint8).tobytes()))
-    monkeypatch.setitem(sys.modules, "liblzfse", SimpleNamespace(decompress=zlib.decompress))
+    monkeypatch.setitem(sys.modules, "liblzfse", SimpleNamespace(decompress=zlib.decompress, error=zlib.error))
     readings = read_sensor_depth(SensorDepth(path, confidence=tmp_path / "0.conf"), tmp_path / "0.jpg")
     assert np.array_equal(readings.z, Z)
     assert (readings.confidence == 0.5).all()

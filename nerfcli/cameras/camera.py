@@ -268,7 +268,7 @@ class Camera:
         try:
             model, params = str(content["model"]), tuple(float(value) for value in content["params"])
             width, height = int(content["width"]), int(content["height"])
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise UserError(
                 f"not a valid camera: {type(error).__name__}: {error}",
                 'expected {"model": COLMAP\'s name, "width": pixels, "height": pixels, "params": [numbers]}',

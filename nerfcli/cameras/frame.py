@@ -33,7 +33,7 @@ class SensorDepth:
     @classmethod
     def found(cls, *paths: Path, unit: float = 1.0, confidence: Path | None = None) -> "SensorDepth | None":
         """Return the first of these maps that is on disk, with its confidence if that is; None without one."""
-        path = next(filter(Path.is_file, paths), None)
+        path = next(filter(os.path.isfile, paths), None)  # names may be too long for Path.is_file
         if path is None:
             return None
         return cls(path, unit, confidence if confidence is not None and confidence.is_file() else None)

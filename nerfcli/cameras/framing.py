@@ -114,7 +114,7 @@ def equirectangular(width: int, height: int) -> Camera:
     if width != 2 * height:
         raise UserError(
             f"invalid size of an equirectangular picture: {width}x{height}",
-            "its width must be twice its height; give only --width or only --height",
+            "its width must be twice its height; give only an even --width, or only --height",
             exit_code=2,
         )
     return Camera("EQUIRECTANGULAR", width, height, (width, height))

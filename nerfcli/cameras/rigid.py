@@ -203,7 +203,7 @@ class Similarity:
             scale = float(content["scale"])
             rotation = np.array(content["rotation"], dtype=np.float64)
             translation = np.array(content["translation"], dtype=np.float64)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise _bad_similarity(f"{type(error).__name__}: {error}") from error
         if rotation.shape != (3, 3) or translation.shape != (3,):
             raise _bad_similarity(f"rotation {rotation.shape} and translation {translation.shape}")

@@ -6,6 +6,7 @@ an archive of photos can hold.
 """
 
 import hashlib
+import re
 import shutil
 import stat
 import struct
@@ -28,6 +29,8 @@ ARCHIVE_FILE = "archive.json"
 
 # Photos hardly shrink when packed, and tables of text to a tenth: more than this is an attack ("zip bomb").
 MOST_RATIO = 50
+# Characters that a listing does not show as they are: controls, parts of characters, changes of the writing direction.
+_HIDDEN = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]")
 _SMALL_BYTES = 100 << 20
 MOST_FILES = 1_000_000
 _BLOCK_BYTES = 1 << 20
@@ -91,7 +94,7 @@ def _checked(path: Path, entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo
         entry.filename = entry.filename.replace("\\", "/")  # as some programs on Windows write it
         parts = PurePosixPath(entry.filename).parts
         wrong = not parts or ":" in entry.filename or entry.filename.startswith("/")
-        if wrong or ".." in parts or not entry.filename.isprintable():
+        if wrong or ".." in parts or _HIDDEN.search(entry.filename):
             raise UserError(f"{path} is not safe to unpack: it has a file named {entry.filename!r:.80}", hint)
         kind = stat.S_IFMT(entry.external_attr >> 16)
         if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
@@ -104,8 +107,8 @@ def _checked(path: Path, entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo
             raise UserError(f"{path} is not safe to unpack: {entry.filename} is in it twice", hint)
     total = sum(entry.file_size for entry in members.values())
     if len(members) > MOST_FILES or total > max(_SMALL_BYTES, MOST_RATIO * path.stat().st_size):
-        what = f"{several(len(members), 'file')} of {total / 1e9:.1f} GB in {path.stat().st_size / 1e6:.1f} MB"
-        raise UserError(f"{path} is not safe to unpack: it says that it has {what}", hint)
+        what = f"{several(len(members), 'file')} ({total / 1e9:.1f} GB) in {path.stat().st_size / 1e6:.1f} MB"
+        raise UserError(f"{path} is not safe to unpack: it claims to hold {what}", hint)
     if not members:
         raise UserError(f"{path} contains no files", "copy or download it again")
     if all(PurePosixPath(name).suffix in ARCHIVES for name in members):

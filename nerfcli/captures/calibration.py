@@ -84,7 +84,7 @@ def calibrated(calibration: Calibration, pictures: Sequence[Picture]) -> tuple[P
 
 def _of_picture(calibration: Calibration, picture: Picture, same_name: Mapping[str, int]) -> PhotoCalibration:
     """Return the camera of a photo; `same_name` are the listed images of its name and the indices of their cameras."""
-    path = picture.path.as_posix()
+    path = picture.path.absolute().as_posix()
     same_folder = {number for name, number in same_name.items() if path.endswith(f"/{name}") and "/" in name}
     listed = same_folder or set(same_name.values())
     if len(listed) > 1:

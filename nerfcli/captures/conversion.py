@@ -17,7 +17,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.registry import recognise, with_masks
 from nerfcli.captures.orientation import STORED, UPRIGHT, ReorientedCapture, in_pixels
-from nerfcli.errors import GATE_NOT_MET, UserError
+from nerfcli.errors import GATE_NOT_MET, UserError, several
 
 TOLERANCE_PX = 1e-6
 # Coordinates are rounded to 2^-53 of their size, several times, by the writer and by the parser.
@@ -181,7 +181,7 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Targe
     turned = in_pixels(capture, _pixels(form, wanted))
     capture = turned.capture
     off = len(turned.masks_left_out)
-    turned_masks = (f"{off} masks of photos with an EXIF orientation, which have the other orientation",) if off else ()
+    turned_masks = (f"{several(off, 'mask')} not turned like the photo (EXIF orientation)",) if off else ()
     losses = (*turned_masks, *form.losses(capture))
     # 2D features are data of structure from motion, which nobody expects in other formats: losing them is no reason to
     # refuse.
@@ -212,10 +212,11 @@ def _orientation_notes(turned: ReorientedCapture) -> tuple[str, ...]:
     notes = []
     if turned.num_turned:
         stored = "as stored, as most programs expect" if turned.capture.pixels == STORED else "upright"
-        notes.append(f"{turned.num_turned} photos have an EXIF orientation: their cameras refer to pixels {stored}")
+        turning = several(turned.num_turned, "photo has", "photos have")
+        notes.append(f"{turning} an EXIF orientation: the cameras refer to pixels {stored}")
     if turned.num_unknown:
         notes.append(
-            f"{turned.num_unknown} photos are missing: if they have an EXIF orientation, their cameras will be wrong"
+            f"{several(turned.num_unknown, 'photo is', 'photos are')} missing: cameras of turned ones will be wrong"
         )
     return tuple(notes)
 
@@ -270,6 +271,7 @@ def _files(form: Format, path: Path) -> list[Path]:
 @contextmanager
 def _kept_on_success(path: Path, there: list[Path], files: list[Path]) -> Iterator[None]:
     """Set existing files aside; on any exception remove written files and new folders, and put the old files back."""
+    path = path.absolute()  # "." has no name
     folders = {folder for file in files for folder in file.parents} | {path, *path.parents}
     missing = sorted((folder for folder in folders if not folder.exists()), key=lambda folder: -len(folder.parts))
     place = path.with_name(f".{path.name}.aside-{os.getpid()}")  # not the name that atomic_folder uses

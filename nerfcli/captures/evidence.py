@@ -18,6 +18,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.errors import UserError
 from nerfcli.matching.agreement import agreement, fundamental_matrix, rays_of
 from nerfcli.matching.features import Features, Matches, find_features, mutual_matches
+from nerfcli.photos.images import HEIC_SUFFIXES, read_image
 
 # The longer side of the photos in which features are detected: a larger one finds better features, but takes longer.
 LONGER_SIDE_PX = 1000
@@ -101,6 +102,9 @@ def _stored_or_shown(camera: Camera, path: Path) -> tuple[np.ndarray, Camera]:
             return grey, camera.resized(grey.shape[1], grey.shape[0])
         except UserError as mismatch:
             error = UserError(f"{path}: {mismatch.message}", mismatch.hint)
+    if path.suffix.lower() in HEIC_SUFFIXES:  # which OpenCV does not read
+        grey = cv2.cvtColor(np.ascontiguousarray(read_image(path)[..., :3]), cv2.COLOR_RGB2GRAY)
+        return grey, camera.resized(grey.shape[1], grey.shape[0])
     raise error
 
 
@@ -143,8 +147,11 @@ class ObservationEvidence:
         self.name = f"{len(rows)} observations of points in {len(np.unique(self.groups))} photos"
 
     def directions(self, convention: Convention) -> tuple[np.ndarray, ...]:
-        """Return the unit viewing directions of the pixels, (M, 3), and their pixels per radian."""
-        return _directions(self._cameras, self.groups, self._pixels, convention)
+        """Return the unit viewing directions of the pixels, (M, 3), and their pixels per radian.
+
+        Observations are in the convention of the file, as its principal points are.
+        """
+        return _directions(self._cameras, self.groups, self._pixels + (0.5 - convention.pixel_centre), convention)
 
     def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
         """Return the error of each observation, (M,)."""

@@ -13,7 +13,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
-from nerfcli.errors import UserError
+from nerfcli.captures.formats.fields import decoded
+from nerfcli.errors import UserError, several
 
 # By default, one of this many photos in the order of their names is held out.
 HELD_OUT_EVERY = 8
@@ -95,12 +96,12 @@ def moments(names: Iterable[str]) -> list[list[str]]:
 
 def _in_order(name: str) -> list[tuple[int, int, str]]:
     """Return a sort key that compares numbers by value: frame_9 before frame_10."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.findall(r"\d+|\D+", name)]
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.findall(r"\d+|\D+", name)]
 
 
 def _listed(path: Path, present: frozenset[str], others: frozenset[str]) -> frozenset[str]:
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = decoded(path.read_bytes()).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path} cannot be read: {error}", "give a text file with one name per line") from error
     listed = frozenset(line.strip() for line in lines if line.strip())
@@ -108,7 +109,7 @@ def _listed(path: Path, present: frozenset[str], others: frozenset[str]) -> froz
     if unknown:
         shown = ", ".join(unknown[:_NAMES_SHOWN])
         raise UserError(
-            f"{path} lists {len(unknown)} names that match no photo: {shown}",
+            f"{path} lists {several(len(unknown), 'name that matches', 'names that match')} no photo: {shown}",
             f"write names as in the capture, such as {min(present, default='a.jpg')}",
         )
     return listed & present

@@ -15,7 +15,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import run_cameras
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.registry import recognise
-from nerfcli.captures.holdout import default_split, names_held_out
+from nerfcli.captures.holdout import HELD_OUT_EVERY, default_split, names_held_out
 from nerfcli.captures.orientation import UPRIGHT, counted, measure_of, rescaling, upright
 from nerfcli.errors import UserError, in_shell
 from nerfcli.photos.masks import masks_inside
@@ -89,6 +89,12 @@ def with_photos_on_disk(path: Path, form: Format, found: Path, capture: Capture)
     if form.is_unordered:
         order.sort(key=lambda index: frames[index].name)
     order = [index for index in order if frames[index].split not in form.unused_splits]
+    if frames and not order:
+        raise UserError(
+            f"{found}: {form.name} ({form.of}), all {len(frames)} photos are of a split that is not used "
+            f"({', '.join(sorted(form.unused_splits))})",
+            "give the file that lists the training photos, too",
+        )
     fitted = {index: _upright(capture, frames[index]) for index in order if frames[index].has_photo}
     if not fitted:
         first, video = frames[order[0] if order else 0], form.video(found)
@@ -138,10 +144,10 @@ def refuse_without_training_photos(scene: Capture) -> None:
         UserError: no training photo is left.
     """
     if not scene.train_frames:
-        raise UserError(
-            f"{scene.root} has no training photo",
-            "every 8th photo is held out, so at least 2 are needed; check --holdout",
-        )
+        hint = "its split lists none: choose another with --holdout, such as every:8"
+        if len(scene.frames) < 2:
+            hint = f"every {HELD_OUT_EVERY}th photo is held out, so at least 2 are needed"
+        raise UserError(f"{scene.root} has no training photo", hint)
 
 
 def describe_unused_masks(scene: Capture) -> str | None:

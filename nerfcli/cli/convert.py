@@ -194,8 +194,8 @@ def convert(
 
     What was written is read back, and its points and the rays of its pixels are compared with the capture; if they
     differ, nothing is kept and the exit code is 7.
-    Anything that the format cannot hold is listed, and the conversion is refused without --allow-loss (2D features are
-    optional). Photos are not changed.
+    Anything that the format cannot hold is listed, and the conversion is refused without --allow-loss (2D features may
+    be dropped without it). Photos are not changed.
 
     \b
     Formats read:     nerfcli, colmap, transforms (nerfstudio, instant-ngp), blender, llff, opensfm, metashape,

@@ -25,6 +25,8 @@ _SPAN_LOOK, _SPAN_BAD = 20.0, 6.0
 _ASPECT_LOOK = 0.02
 # GPS of phones is off by 5 m under open sky and by tens of metres indoors; a metric scale needs a wider capture.
 _GPS_WIDE = 100.0
+# Points that are enough for the median depth of a photo.
+_MOST_POINTS = 20_000
 
 
 def spread(scene: Capture) -> Finding:
@@ -144,7 +146,7 @@ def check_scene_files(scene: Capture) -> list[Finding]:
     total = len(missing) + len(scene.frames)
     masked = [frame.name for frame in scene.frames if frame.mask is not None]
     unmasked = [(frame.name, "no mask") for frame in scene.frames if frame.mask is None] if masked else []
-    verdict = BAD if len(missing) > 0.5 * total else LOOK if missing else GOOD
+    verdict = BAD if len(missing) >= 0.5 * total and missing else LOOK if missing else GOOD
     summary = f"{len(missing)} of {several(total, 'listed photo')} missing" if missing else "none"
     advice = "put them back, or continue with the others" if missing else ""
     remarks, threshold = tuple((name, "missing") for name in missing), "look from 1, bad from half of them"
@@ -183,11 +185,10 @@ def _depths(scene: Capture) -> np.ndarray:
         return 2 / (1 / scene.depth_bounds).sum(axis=1)
     if len(scene.points):
         depths = np.full(len(frames), np.nan)
+        points = scene.points[:: 1 + len(scene.points) // _MOST_POINTS]
         for index, frame in enumerate(frames):
-            local = rigid.apply(rigid.inverse(frame.world_from_cam), scene.points)
-            pixels, valid = frame.camera.project(local)
-            inside = valid & (local[:, 2] > 0) & (pixels >= 0).all(axis=1)
-            inside &= (pixels <= (frame.camera.width, frame.camera.height)).all(axis=1)
+            local = rigid.apply(rigid.inverse(frame.world_from_cam), points)
+            inside = frame.camera.shows(local)
             if inside.any():
                 depths[index] = np.median(local[inside, 2])
         if not np.isnan(depths).all():

@@ -49,7 +49,7 @@ def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding
     fraction = len(parts[0]) / len(photos)
     verdict = worst([GOOD if len(parts) == 1 else BAD if fraction < 0.9 else LOOK, LOOK if weak else GOOD])
     sizes = " + ".join(str(len(part)) for part in parts[:6]) + (" + ..." if len(parts) > 6 else "")
-    separate = f"{len(parts)} parts without matches between them: {sizes}"
+    separate = f"{len(parts)} groups of photos that do not match each other: {sizes}"
     summary = separate if len(parts) > 1 else "all photos are connected"
     if weak:
         summary += f"; {several(len(weak), 'photo')} only weakly"
@@ -141,7 +141,7 @@ def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Findi
         advice += "; content fixed in the image is a watermark, a strap, or the background of a turntable"
     summary = f"independent movement in {several(len(moving_photos), 'photo')}"
     remarks = tuple((name, what) for _, name, what in sorted(moving_photos, reverse=True))
-    return Finding("moving content", BAD if fraction > 0.5 else LOOK, summary, fraction, threshold, advice, remarks)
+    return Finding("moving content", BAD if fraction >= 0.5 else LOOK, summary, fraction, threshold, advice, remarks)
 
 
 def turning_object(pairs: Sequence[Pair]) -> Finding | None:

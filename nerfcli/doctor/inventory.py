@@ -29,7 +29,7 @@ def readable(unreadable: Mapping[str, str], photos: Sequence[PhotoFacts], skippe
     bad, total = len(unreadable), len(unreadable) + len(photos)
     paged = [photo.name for photo in photos if photo.exif.pages > 1]
     notes = f"; other files, not used: {skipped}" if skipped else ""
-    notes += f"; the largest page is used of {several(len(paged), 'file')}, such as {paged[0]}" if paged else ""
+    notes += f"; only the largest page of {several(len(paged), 'file')} is used, such as {paged[0]}" if paged else ""
     threshold = "look from 1, bad from 10 % of the photos"
     if not bad:
         return Finding("files", GOOD, f"all {several(total, 'photo')} can be read{notes}", 0, threshold)
@@ -58,10 +58,11 @@ def size(photos: Sequence[PhotoFacts]) -> Finding:
     listed = ", ".join(f"{text} ({number})" for text, number in sizes.most_common(3))
     listed += f" and {len(sizes) - 3} other sizes" if len(sizes) > 3 else ""
     verdict = verdict_below(smallest, look=SMALL_PX, bad=SMALL_PX // 2)
-    small = [(photo.name, f"{side} px") for photo, side in zip(photos, longer, strict=True) if side < SMALL_PX]
+    small = sorted((side, photo.name) for photo, side in zip(photos, longer, strict=True) if side < SMALL_PX)
+    remarks = tuple((name, f"{side} px") for side, name in small)
     threshold = f"longer side: look below {SMALL_PX} px, bad below {SMALL_PX // 2} px"
     advice = "" if verdict == GOOD else "use the original files, not previews or downloads from a messenger"
-    return Finding("size", verdict, listed, smallest, threshold, advice, tuple(sorted(small, key=lambda item: item[1])))
+    return Finding("size", verdict, listed, smallest, threshold, advice, remarks)
 
 
 def cameras(photos: Sequence[PhotoFacts]) -> Finding:

@@ -116,7 +116,11 @@ def examine_capture(
     page.claim_page(output, target, page.Mark("doctor", capture.path), about="capture")
     count, threads = len(capture.sources), resources.cores
     reporter.note(f"{capture.path}: {count} photos, about {duration(estimated_seconds(count, threads))}")
+    own_threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # photos and pairs are processed in parallel; OpenCV's threads would only wait for each other
-    diagnosis = examine(capture, threads=threads, progress=reporter.progress, calibration=calibration)
+    try:
+        diagnosis = examine(capture, threads=threads, progress=reporter.progress, calibration=calibration)
+    finally:
+        cv2.setNumThreads(own_threads)
     page.write_page(page_html(diagnosis), target)
     return diagnosis

@@ -16,6 +16,7 @@ from nerfcli.photos.colours import linear_light
 from nerfcli.photos.exif import Exif, read_exif
 from nerfcli.photos.focal_evidence import with_digital_zoom
 from nerfcli.photos.images import downscale, read_image
+from nerfcli.photos.masks import read_mask
 from nerfcli.photos.panoramas import MOST_OF_A_CAMERA, is_panorama
 
 # Longer side of the pictures in which features are detected; all thresholds in pixels refer to this size.
@@ -165,7 +166,7 @@ def read_photo(source: Source, most_features: int) -> PhotoFacts:
     del image
     rgb, used = _opaque(large)
     if source.mask is not None:
-        mask = cv2.resize(read_image(source.mask)[..., :3].max(axis=2), used.shape[::-1], interpolation=cv2.INTER_AREA)
+        mask = cv2.resize(read_mask(source.mask, source.path), used.shape[::-1], interpolation=cv2.INTER_AREA)
         used = used & (mask > 127)
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     sharp, local_detail = measure_sharpness(np.where(used, grey, grey[used].mean() if used.any() else 0).astype("f4"))

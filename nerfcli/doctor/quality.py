@@ -63,7 +63,7 @@ def sharpness(photos: Sequence[PhotoFacts], missing: np.ndarray) -> Finding:
     middle = float(np.median(own[~blank])) if (~blank).any() else float("nan")
     whole = GOOD if np.isnan(middle) else verdict_below(middle, look=SOFT, bad=VERY_SOFT)
     fraction = float(blurred.mean())
-    verdict = worst([whole, BAD if fraction > 0.3 or very.mean() > 0.1 else LOOK if blurred.any() else GOOD])
+    verdict = worst([whole, BAD if fraction >= 0.3 or very.mean() > 0.1 else LOOK if blurred.any() else GOOD])
     parts, advice = [], []
     if blurred.any():
         parts.append(f"{blurred.sum()} of {several(len(photos), 'photo')} blurred")
@@ -175,7 +175,7 @@ def clipping(photos: Sequence[PhotoFacts]) -> Finding:
     )
     if not flagged:
         return Finding("clipping", GOOD, "little", 0.0, threshold)
-    verdict = BAD if verdicts.count(BAD) > 0.3 * len(photos) else LOOK
+    verdict = BAD if verdicts.count(BAD) >= 0.3 * len(photos) else LOOK
     summary = f"{several(len(flagged), 'photo')} of {len(photos)} with large pure white or black areas, or dark"
     advice = "expose so that the subject is neither; such areas cannot be matched (in a background this is fine)"
     remarks = tuple((name, what) for _, name, what in sorted(flagged, key=lambda item: -item[0]))

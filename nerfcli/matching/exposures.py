@@ -24,12 +24,11 @@ def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]
     least absolute errors. NaN for photos that share too little with the others to be compared.
     """
     levels = [np.ascontiguousarray(photo.pixels[..., :3]) for photo in photos]
-    # Averaged, so that misalignments by a pixel hardly matter, and not 0, so that logarithms are finite.
-    around = [cv2.blur(pixels, (3, 3)).astype(np.float64) / 255.0 for pixels in levels]
-    light = [linear_light(np.maximum(pixels, 1e-3)) for pixels in around]
+    # Averaged, so that misalignments by a pixel hardly matter.
+    around = [cv2.blur(pixels, (3, 3)) for pixels in levels]
     maps = []
     for photo, depth in zip(photos, dense, strict=True):
-        distances = np.full(photo.pixels.shape[:2], np.nan)
+        distances = np.full(photo.pixels.shape[:2], np.nan, np.float32)
         distances[depth.pixels[:, 1], depth.pixels[:, 0]] = depth.distances
         maps.append(distances)
     centres = np.array([photo.frame.centre for photo in photos])
@@ -54,11 +53,18 @@ def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]
             seen &= ((both > DARKEST) & (both < BRIGHTEST)).all(1)
             if seen.sum() < FEWEST_PIXELS:
                 continue
-            ratio = light[other][row[seen], column[seen]] / light[one][pixels[seen, 1], pixels[seen, 0]]
+            ratio = _light(around[other][row[seen], column[seen]]) / _light(
+                around[one][pixels[seen, 1], pixels[seen, 0]]
+            )
             pairs.append((one, other))
             ratios.append(np.median(np.log(ratio), axis=0))
             counts.append(min(int(seen.sum()), 500))  # errors of neighbouring pixels are correlated
     return _gains(len(photos), np.array(pairs).reshape(-1, 2), np.array(ratios).reshape(-1, 3), np.array(counts))
+
+
+def _light(levels: np.ndarray) -> np.ndarray:
+    """Return the linear light of levels of 255; not 0, so that logarithms are finite."""
+    return linear_light(np.maximum(levels / 255.0, 1e-3))
 
 
 def _gains(count: int, pairs: np.ndarray, ratios: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -80,7 +86,8 @@ def _gains(count: int, pairs: np.ndarray, ratios: np.ndarray, weights: np.ndarra
         robust, found = np.ones(len(first)), np.zeros(len(group))
         for _ in range(5):
             root = np.append(np.sqrt(weights[inside] * robust), 1.0)
-            found = np.linalg.lstsq(design * root[:, None], wanted * root, rcond=None)[0]
+            weighted = design * root[:, None]
+            found = np.linalg.solve(weighted.T @ weighted, weighted.T @ (wanted * root))
             robust = 1.0 / np.maximum(np.abs(design[:-1] @ found - wanted[:-1]), 0.01)
         gains[group, channel] = found
     return gains

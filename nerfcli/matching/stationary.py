@@ -9,6 +9,7 @@ geometry of the rest. Copies of one photo have matches that do not move, but no 
 Letters: x and y are the pixels of a match in the first and in the second photo, F a fundamental matrix.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -199,8 +200,8 @@ def motions(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> Motions:
 def together(pairs: Sequence[tuple[int, int, Motions]]) -> Stationary:
     """Summarize pairs (photo, photo, motions)."""
     two = [pair for pair in pairs if pair[2].two]
-    often = [cell for _, _, pair in two for cell in pair.cells]
-    cells = [cell for cell in set(often) if often.count(cell) >= 2]
+    counts = Counter(cell for _, _, pair in two for cell in pair.cells)
+    cells = [cell for cell, count in counts.items() if count >= 2]
     columns, rows = _CELLS
     extent = 0.0
     if cells:

@@ -137,8 +137,9 @@ def _neighbours(points: np.ndarray, shown: np.ndarray, centres: np.ndarray) -> l
     rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)
     found = []
     for index in range(len(centres)):
-        both = shown & shown[index]
-        angles = np.arccos(np.clip(np.einsum("opi,pi->op", rays, rays[index]), -1.0, 1.0))
+        own = shown[index]
+        both = shown[:, own]
+        angles = np.arccos(np.clip(np.einsum("opi,pi->op", rays[:, own], rays[index, own]), -1.0, 1.0))
         off = np.degrees(angles) - 5.0
         fits = np.exp(-0.5 * np.square(off / np.where(off < 0, 1.0, 10.0)))
         scores = np.where(both & (angles > LEAST_ANGLE_RAD), fits, 0.0).sum(1)

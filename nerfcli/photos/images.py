@@ -4,6 +4,7 @@ The EXIF orientation is applied once, here, so that sizes, pixels and cameras al
 """
 
 import io
+import os
 import struct
 import warnings
 import zlib
@@ -357,13 +358,12 @@ def list_photos(folder: Path, *, subfolders: bool = False) -> Listing:
         read, unread = list_images(each), _unreadable(each)
         pictures += read
         unreadable += unread
-        files = (path for path in each.iterdir() if path not in {*read, *unread} and path.is_file())
-        names = (path for path in files if not path.name.startswith(".") and path.name not in _OURS_OR_SYSTEM)
-        counts.update(path.suffix.lower() or "without a suffix" for path in names)
+        others = sorted({*each.iterdir()} - {*read, *unread, *(each / name for name in _OURS_OR_SYSTEM)})
+        shown = (path for path in others if path.is_file() and not path.name.startswith("."))
+        counts.update(path.suffix.lower() or "without a suffix" for path in shown)
     skipped = ", ".join(f"{count} {suffix}" for suffix, count in counts.most_common())
-    for paths in (pictures, unreadable):
-        paths.sort(key=lambda path: name_in(folder, path))
-    return Listing(pictures, unreadable, skipped)
+    found = (sorted(paths, key=lambda path: name_in(folder, path)) for paths in (pictures, unreadable))
+    return Listing(*found, skipped)
 
 
 def name_in(folder: Path, path: Path) -> str:
@@ -373,7 +373,8 @@ def name_in(folder: Path, path: Path) -> str:
 
 def where_photos_may_be(folder: Path) -> str:
     """Return a hint for a folder without photos: which of its subfolders have some, or what is expected."""
-    with_photos = [child for child in sorted(folder.iterdir()) if child.is_dir() and list_images(child)]
+    shown = (child for child in sorted(folder.iterdir()) if child.is_dir() and not child.name.startswith("."))
+    with_photos = [child for child in shown if os.access(child, os.R_OK | os.X_OK) and list_images(child)]
     if len(with_photos) == 1:
         return f"there are photos in {with_photos[0]}; give that folder"
     if with_photos:
@@ -385,8 +386,7 @@ def where_photos_may_be(folder: Path) -> str:
 
 def _with_subfolders(folder: Path) -> list[Path]:
     """Return a folder and all of its subfolders; not hidden ones, nor links to the others."""
-    below = (path for path in folder.rglob("*") if path.is_dir())
-    shown = [path for path in below if "/." not in f"/{name_in(folder, path)}"]
+    shown = [path for path in folder.rglob("*") if path.is_dir() and "/." not in f"/{name_in(folder, path)}"]
     folders = [folder, *sorted(shown, key=Path.is_symlink)]
     return list({path.resolve(): path for path in reversed(folders)}.values())
 

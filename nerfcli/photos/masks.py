@@ -4,6 +4,7 @@ A mask is a picture in any format, named after its photo. It has the size of the
 the file: tools that ignore the EXIF orientation write the latter, and the mask is then turned like the photo.
 """
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -36,7 +37,7 @@ def find_mask(name: str, masks: Path) -> Path | None:
         whole,
         *(base.with_name(base.name + suffix) for base in (whole, stem, named_mask) for suffix in suffixes),
     ]
-    return next((mask for mask in candidates if mask.is_file()), None)
+    return next(filter(os.path.isfile, candidates), None)  # names may be too long for Path.is_file
 
 
 def masks_inside(folder: Path, names: Sequence[str]) -> Path | None:

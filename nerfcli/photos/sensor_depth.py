@@ -68,7 +68,7 @@ def read_sensor_depth(depth: SensorDepth, photo: Path) -> DepthReadings:
         across, down = _MIRRORED[exif.orientation]
         z, confidence = (np.ascontiguousarray(values.T[::down, ::across]) for values in (z, confidence))
     if not _is_shaped(z, (exif.width, exif.height)):
-        shape = f"{z.shape[1]}x{z.shape[0]}, of another shape than its photo with {exif.width}x{exif.height}"
+        shape = f"{z.shape[1]}x{z.shape[0]}, which is not the shape of its {exif.width}x{exif.height} photo"
         raise UserError(f"{depth.path} is {shape}", _HINT)
     return DepthReadings(z, confidence)
 
@@ -94,10 +94,10 @@ def _numbers(path: Path, aspect: float) -> np.ndarray:
                 with opened(path) as image:
                     found = np.array(image)
     except (OSError, ValueError, RuntimeError, TypeError, EOFError, StopIteration) as error:
-        raise UserError(f"{path} is no depth map: {reason_of(error)}", _HINT) from error
+        raise UserError(f"{path} is not a depth map: {reason_of(error)}", _HINT) from error
     found = found.squeeze()
     if found.ndim != 2 or found.dtype.kind not in "uif":
-        raise UserError(f"{path} is no depth map: numbers of type {found.dtype} in shape {found.shape}", _HINT)
+        raise UserError(f"{path} is not a depth map: numbers of type {found.dtype} in shape {found.shape}", _HINT)
     return found
 
 
@@ -108,7 +108,10 @@ def _unpacked(path: Path, dtype: type, aspect: float) -> np.ndarray:
     except ImportError as error:
         hint = "install it with: pip install 'nerfcli[record3d]'; or export as \"EXR + RGB\" from Record3D"
         raise UserError(f"{path} is compressed with LZFSE, which needs pyliblzfse", hint) from error
-    values = np.frombuffer(liblzfse.decompress(path.read_bytes()), dtype)
+    try:
+        values = np.frombuffer(liblzfse.decompress(path.read_bytes()), dtype)
+    except liblzfse.error as error:  # derived from Exception alone
+        raise ValueError(f"damaged LZFSE data: {error}") from error
     return values.reshape(round(math.sqrt(len(values) / aspect)), -1)
 
 

@@ -59,6 +59,8 @@ _UNREAD = {
 # Numbers of channels of PGM and PPM, picture formats that state their own size.
 _CHANNELS = {b"P5": 1, b"P6": 3}
 _LINES_KEPT = 60
+# Frames of one call of ffmpeg: systems limit the length of a command line, Windows to 32,767 characters.
+_MOST_NUMBERS = 1000
 ANOTHER_FFMPEG = "install ffmpeg, and set the environment variable IMAGEIO_FFMPEG_EXE to its path"
 
 
@@ -255,6 +257,12 @@ def read_frames(video: Video, numbers: Sequence[int]) -> Iterator[np.ndarray]:
     Raises:
         UserError: a frame is missing, as the video has changed since it was measured.
     """
+    for first in range(0, len(numbers), _MOST_NUMBERS):
+        yield from _read_some(video, numbers[first : first + _MOST_NUMBERS])
+
+
+def _read_some(video: Video, numbers: Sequence[int]) -> Iterator[np.ndarray]:
+    """Yield the frames of `read_frames`, at most `_MOST_NUMBERS`."""
     given = 0
     # The fields of a frame are interpolated with those of its neighbours, so before the choice.
     filters = f"{video._whole_frames}select='{_one_of(numbers)}',{_SRGB_FROM_HDR if video.hdr else ''}{_UPRIGHT}"
@@ -317,7 +325,7 @@ class _Decoder:
                 continue
             if counts := _FIELDS.search(line):
                 self.counts = (int(counts[1]), int(counts[2]), int(counts[3]))
-            if len(self.head) < _LINES_KEPT:
+            if len(self.head) < _LINES_KEPT or _STREAM.search(line):  # chapters and tags come before the streams
                 self.head.append(line)
             if error := _ERROR.search(line):
                 self.errors += 1

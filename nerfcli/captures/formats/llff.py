@@ -22,7 +22,7 @@ from nerfcli.captures.formats.fields import DAMAGED, array_of_npy
 from nerfcli.captures.formats.format import Format, UserInputs, folder_with
 from nerfcli.captures.formats.limits import FramePoses, checked_camera, plausible
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, several
 from nerfcli.photos.images import list_images
 
 FILE = "poses_bounds.npy"
@@ -132,7 +132,7 @@ def _photos_of_rows(path: Path, count: int, folders: Sequence[Path]) -> Sequence
         photos = list_images(folder)
         if len(photos) == count:
             return photos
-        found.append(f"{folder.name}/ has {len(photos)}")
+        found.append(f"{folder.name}/ has {several(len(photos), 'photo')}")
     raise UserError(
         f"{path} has {count} rows, but {', '.join(found)}", "there must be exactly one photo per row, sorted by name"
     )

@@ -3,7 +3,7 @@
 All commands that read captures go through it.
 """
 
-import os
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -115,9 +115,13 @@ def recognise(path: Path) -> tuple[Format, Path]:
 
 
 def _captures_in(path: Path) -> list[Path]:
-    """Return the folders in a folder which are captures."""
-    folders = [child for child in sorted(path.iterdir()) if child.is_dir()] if path.is_dir() else []
-    return [folder for folder in folders if os.access(folder, os.R_OK | os.X_OK) and recognised(folder) is not None]
+    """Return the folders in a folder which are captures, as far as they can be read."""
+    found = []
+    for folder in sorted(path.iterdir()) if path.is_dir() else ():
+        with suppress(OSError):
+            if folder.is_dir() and recognised(folder) is not None:
+                found.append(folder)
+    return found
 
 
 def refuse_archive(path: Path) -> None:
@@ -152,13 +156,13 @@ def format_named(name: str) -> Format:
 def depths_beside(photos: Path) -> dict[str, SensorDepth]:
     """Return the depth maps of a sensor by the names of the photos in a folder, which is part of a capture.
 
-    A capture around it that is damaged has none.
+    A capture around it that is damaged or must not be read has none.
     """
     home = photos.resolve()
     try:
-        form, found = recognise(home.parent)
-        frames = form.parse(found, UserInputs()).frames
-    except UserError:
+        around = recognised(home.parent)
+        frames = () if around is None else around[0].parse(around[1], UserInputs()).frames
+    except (UserError, OSError):
         return {}
     inside = [(frame.image.resolve(), frame.depth) for frame in frames if frame.image and frame.depth]
     return {image.relative_to(home).as_posix(): depth for image, depth in inside if image.is_relative_to(home)}

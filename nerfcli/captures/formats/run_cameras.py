@@ -13,6 +13,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.format import Format
+from nerfcli.captures.formats.photo_names import seen_from
 from nerfcli.errors import UserError
 from nerfcli.photos.held_out_exposure import PhotoExposures
 
@@ -123,8 +124,8 @@ def _frame_to_json(frame: Frame, run: Path, given: Mapping[str, Frame]) -> dict[
         **_view_to_json(frame),
         **({} if before is None else {_GIVEN: _view_to_json(before)}),
         # Relative, so that scene and run can be moved together; if only the run was moved, `written_at` locates them.
-        "image": None if frame.image is None else os.path.relpath(frame.image, run),
-        "mask": None if frame.mask is None else os.path.relpath(frame.mask, run),
+        "image": None if frame.image is None else seen_from(run, frame.image),
+        "mask": None if frame.mask is None else seen_from(run, frame.mask),
     }
 
 

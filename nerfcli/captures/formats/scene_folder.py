@@ -27,6 +27,7 @@ from nerfcli.version import __version__
 
 SCENE_FILE = "scene.json"
 MODEL_FOLDER = "sparse/0"
+POSES_REPORT = "poses_report.json"
 SCENE_FILES = (SCENE_FILE, *(f"{MODEL_FOLDER}/{name}.bin" for name in ("cameras", "images", "points3D")))
 SCENE_VERSION = 1
 UNITS = ("arbitrary", "metre")
@@ -353,7 +354,7 @@ FORMAT = Format(
     SCENE_FILE,
     folder_with(SCENE_FILE),
     parse_scene,
-    files=SCENE_FILES,
+    files=(*SCENE_FILES, POSES_REPORT),  # a report of other poses must not stay
     is_unordered=True,
     has_split=True,
     write=write_scene,

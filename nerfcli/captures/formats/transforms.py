@@ -4,6 +4,7 @@ Poses in these files are world_from_cam with OpenGL axes. Pixel positions are as
 Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips.md and scripts/colmap2nerf.py.
 """
 
+import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -61,7 +62,9 @@ def losses_transforms(capture: Capture) -> tuple[str, ...]:
     parts = lost_parts(capture, holds=("masks", "depths", "points", "colours", "splits"))
     others = sum(frame.depth is not None and frame.depth.unit != MILLIMETRE for frame in capture.frames)
     depths = (f"{several(others, 'depth map')} in another unit than millimetres",) if others else ()
-    return (*lost_of_cameras(capture, lost_to_transforms), *parts, *depths)
+    trusted = sum(frame.depth is not None and frame.depth.confidence is not None for frame in capture.frames)
+    confidence = (f"the confidence of {several(trusted, 'depth map')}",) if trusted else ()
+    return (*lost_of_cameras(capture, lost_to_transforms), *parts, *depths, *confidence)
 
 
 def write_transforms(capture: Capture, path: Path) -> None:
@@ -190,7 +193,7 @@ def _masks(
     found = find_photos(sorted(named), (home,), folders=(folder,), others=())
     paths = {name: image for name, image in zip(found.listed, found.paths, strict=True) if image not in photos}
     lost = sorted(name for name in named if paths.get(name) is None)
-    notes = (f"{several(len(lost), 'mask')} left out, which {path.name} names and do not exist: {in_words(lost)}",)
+    notes = (f"{several(len(lost), 'mask')} named in {path.name} left out, not found: {in_words(lost)}",)
     return [paths.get(mask) if mask else None for mask in texts], notes if lost else ()
 
 
@@ -212,7 +215,7 @@ def _known_sizes(
 ) -> list[Size | None]:
     """Return the width and height of each frame's picture, given, measured, or the only ones known; None if unknown."""
     sizes = [
-        stored_size(image) if size is None and image.is_file() else size
+        stored_size(image) if size is None and os.path.isfile(image) else size
         for size, image in zip(given, images, strict=True)
     ]
     known = {size for size in sizes if size is not None} or ({default} if default else set[Size]())

@@ -22,12 +22,12 @@ def lost_parts(capture: Capture, *, holds: Collection[str]) -> list[str]:
     num_observations = 0 if capture.observations is None else len(capture.observations.pixels)
     num_split = sum(frame.split is not None for frame in capture.frames)
     parts = {
-        "masks": (num := sum(frame.mask is not None for frame in capture.frames), f"{num} masks"),
-        "depths": (num := sum(frame.depth is not None for frame in capture.frames), f"{num} depth maps of a sensor"),
-        "points": (num_points, f"{num_points} points"),
-        "colours": (num_points if capture.colours is not None else 0, f"colours of {num_points} points"),
-        "observations": (num_observations, f"{num_observations} observations"),
-        "splits": (num_split, f"the split of {num_split} frames"),
+        "masks": (num := sum(frame.mask is not None for frame in capture.frames), several(num, "mask")),
+        "depths": (num := sum(frame.depth is not None for frame in capture.frames), several(num, "sensor depth map")),
+        "points": (num_points, several(num_points, "point")),
+        "colours": (num_points if capture.colours is not None else 0, f"colours of {several(num_points, 'point')}"),
+        "observations": (num_observations, several(num_observations, "observation")),
+        "splits": (num_split, f"the split of {several(num_split, 'frame')}"),
         "depth bounds": (capture.depth_bounds is not None, "depth bounds"),
         "unit": (capture.unit != "arbitrary", f"the unit of length ({capture.unit})"),
     }

@@ -46,7 +46,7 @@ def measured(read: Callable[[RunMetrics], float | None], form: str) -> Callable[
 def _of_poses(part: str, key: str, form: str) -> Callable[[RunFacts], str]:
     def read(run: RunFacts) -> str:
         content: dict[str, Any] = run.poses or {}
-        value = content.get(part, content).get(key) if part else content.get(key)
+        value = ((content.get(part) or {}) if part else content).get(key)
         return form.format(value) if isinstance(value, int | float) else ""
 
     return read
