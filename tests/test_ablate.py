@@ -5,6 +5,7 @@ import json
 import math
 
 import pytest
+from commands import listing
 from conftest import SPHERES
 from typer.testing import CliRunner
 
@@ -76,27 +77,26 @@ def test_differences_are_taken_seed_by_seed_and_get_a_verdict():
 
 
 def test_an_ablation_goes_on_where_it_stopped(tmp_path, monkeypatch):
-    """After a kill before its third training, the same command trains only the models that are left."""
+    """After kills before its first and third training, the same command trains only the models that are left."""
     from nerfcli.training import loop
 
     monkeypatch.setattr("nerfcli.training.runs.settings.FEWEST_LOG2_ROWS", 10)  # 34 MB for each run otherwise
-    trained, real = [], loop.train
+    trained, real, kills = [], loop.train, [0, 2]
 
     def train(scene, run, settings, **rest):
-        if len(trained) == 2:
+        if kills and len(trained) == kills[0]:
+            del kills[0]
             raise KeyboardInterrupt
         trained.append((settings.components.view, settings.seed))
         real(scene, run, settings, **rest)
 
-    command = ["ablate", str(SPHERES), "-o", str(tmp_path / "out"), "--only", "view", "--seeds", "2", "--steps", "2"]
-    command += ["--downscale", "8", "--threads", "1", "--quiet"]
+    command = ["ablate", str(SPHERES), "-o", str(tmp_path / "out"), "--seeds", "2", "--steps", "2", "--quiet"]
+    command += ["--downscale", "8", "--threads", "1"]
+    of_view = [*command, "--only", "view"]
     monkeypatch.setattr(loop, "train", train)
-    assert CliRunner().invoke(app, command).exit_code == 130
+    assert [CliRunner().invoke(app, of_view).exit_code for _ in range(2)] == [130, 130]
     assert json.loads((tmp_path / "out" / "ablation.json").read_text())["complete"] is False
-    monkeypatch.setattr(
-        loop, "train", lambda *a, **rest: (trained.append((a[2].components.view, a[2].seed)), real(*a, **rest))
-    )
-    done = CliRunner().invoke(app, command)
+    done = CliRunner().invoke(app, of_view)
     assert (done.exit_code, done.stdout.strip()) == (0, str(tmp_path / "out" / "ablation.csv"))
     assert trained == [(3, 0), (3, 0), (0, 0), (3, 1), (0, 1)]  # the first one selects the components
     content = json.loads((tmp_path / "out" / "ablation.json").read_text())
@@ -106,6 +106,14 @@ def test_an_ablation_goes_on_where_it_stopped(tmp_path, monkeypatch):
         rows = list(csv.DictReader(file))
     assert float(rows[1]["difference_db"]) == pytest.approx(content["rows"][1]["difference_db"])
     assert "sampled: 324 random pixels of 3 held-out photos at 12x9" in rows[1]["protocol"]
+    # What would drop results is refused, before anything is written.
+    before = listing(tmp_path / "out")
+    others = [[*of_view, name, value] for name, value in (("--steps", "3"), ("--seed", "1"), ("--seeds", "1"))]
+    for other in (*others, [*command, "--only", "near"]):
+        refused = CliRunner().invoke(app, other)
+        assert (refused.exit_code, len(trained)) == (3, 5)
+        assert "ablation.json exists" in refused.stderr
+    assert listing(tmp_path / "out") == before
 
 
 def test_something_else_is_left_alone(tmp_path):

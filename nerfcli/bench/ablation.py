@@ -10,8 +10,9 @@ from typing import Any
 
 from scipy.special import stdtrit
 
-from nerfcli.atomic import atomic_path, write_json
+from nerfcli.atomic import atomic_path, read_json, write_json
 from nerfcli.errors import UserError
+from nerfcli.output import Output
 from nerfcli.training.runs.components import CHOICES, Components, Value
 
 CHOSEN, AUTO = "chosen", "auto"
@@ -94,7 +95,9 @@ def _variant(chosen: Components, name: str, value: Value, *, adds: bool) -> Vari
 
 
 RESULT, TABLE, RUNS = "ablation.json", "ablation.csv", "runs"
-FORMAT = "nerfcli ablation 2"
+FORMAT = "nerfcli ablation 3"
+# Settings that may change when an ablation is continued, see `Run.is_trained_from`.
+_FREE = {"device", "threads"}
 # Confidence level of the intervals.
 CONFIDENCE = 0.95
 
@@ -209,10 +212,25 @@ def write_results(
         writer.writerows(asdict(row) for row in rows)
 
 
-def refuse_foreign(folder: Path) -> None:
-    """Raise if the folder contains something other than an ablation."""
-    if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / RESULT).exists()):
+def refuse_others(output: Output, folder: Path, about: dict[str, Any]) -> None:
+    """Raise if the folder contains something other than an ablation, or one with results that this one would drop.
+
+    Args:
+        about: description of this ablation, as for `write_results`.
+    """
+    result = folder / RESULT
+    others = folder.is_dir() and any(entry.name != RUNS for entry in folder.iterdir())
+    if folder.is_file() or (others and not result.exists()):
         raise UserError(f"{folder} exists and is not an ablation folder", "choose another folder with -o")
+
+    def is_included() -> bool:
+        hint = "add --overwrite to replace it, or choose another folder with -o"
+        earlier = read_json(result, needed=("settings", "seeds", "varied"), hint=hint)
+        changed = {key for key, value in about["settings"].items() if earlier["settings"].get(key) != value}
+        is_larger = earlier["seeds"] <= about["seeds"] and set(earlier["varied"]) <= set(about["varied"])
+        return is_larger and changed <= _FREE
+
+    output.keeps(result, is_included)
 
 
 def table_of(rows: Sequence[ResultRow]) -> list[tuple[str, ...]]:

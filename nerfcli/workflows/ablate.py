@@ -12,8 +12,9 @@ from nerfcli.bench.ablation import (
     RUNS,
     CaptureTraits,
     MeasuredTraining,
+    ResultRow,
     Variant,
-    refuse_foreign,
+    refuse_others,
     rows_of,
     variants,
     write_results,
@@ -28,6 +29,7 @@ from nerfcli.notices import Reporter
 from nerfcli.output import Output
 from nerfcli.photos.exif import mean_log_exposure, relative_log_exposures
 from nerfcli.photos.images import read_image
+from nerfcli.training.runs.components import CHOICES
 from nerfcli.training.runs.files import STATE
 from nerfcli.training.runs.run import Run
 from nerfcli.training.runs.settings import TrainSettings
@@ -63,7 +65,9 @@ def ablate_scene(
     if not scene.test_frames:
         raise UserError(f"{path} has no held-out photos", "by default every 8th photo is held out; check its split")
     folder = output.beside(path, "-ablation")
-    refuse_foreign(folder)
+    about: dict[str, Any] = {"scene": str(path), "settings": settings.to_json()}
+    about |= {"seeds": seeds, "varied": list(only or CHOICES)}
+    refuse_others(output, folder, about)
 
     def trained(name: str, settings: TrainSettings) -> Run:
         """Return a run with these settings, trained now or by an earlier call."""
@@ -74,11 +78,9 @@ def ablate_scene(
         (target / STATE).unlink(missing_ok=True)
         return run
 
-    about = {"scene": str(path), "settings": settings.to_json(), "complete": False}
     measured: list[MeasuredTraining] = []
     compared: list[Variant] = []
-    rows = rows_of(measured, compared)
-    write_results(folder, rows, measured, about)
+    rows: list[ResultRow] = []
     if settings.model == "auto":
         reporter.progress(0.0, "selecting components for this scene")
         run = trained(AUTO, settings)
