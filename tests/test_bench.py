@@ -166,7 +166,7 @@ def test_the_machine_is_named_and_a_busy_one_is_noticed():
 
 
 @pytest.mark.usefixtures("_few")
-def test_a_bench_of_a_run_writes_table_csv_json_and_plot_and_is_kept(foggy, tmp_path):
+def test_a_bench_of_a_run_writes_table_csv_json_and_plot_and_is_kept(foggy, spheres, tmp_path):
     folder = tmp_path / "bench"
     line = ("bench", foggy, "--budget", "60s", "--threads", "2", "-o", folder)
     first = nerfcli(*line)
@@ -185,6 +185,9 @@ def test_a_bench_of_a_run_writes_table_csv_json_and_plot_and_is_kept(foggy, tmp_
     assert (folder / "bench.png").read_bytes().startswith(b"\x89PNG")
     again = nerfcli(*line)
     assert "is complete" in again.stderr
+    for other in (("bench", spheres.root, *line[2:]), (*line, "--budget", "50s"), (*line, "--threads", "1")):
+        error, hint = error_of(nerfcli(*other))
+        assert (error, "--overwrite" in hint) == (f"Error: {folder / 'bench.json'} exists", True)
     assert json.loads((folder / "bench.json").read_text()) == content
     with files_of_at_most(100):
         result = nerfcli(*line, "--overwrite")
@@ -203,6 +206,7 @@ def test_an_interrupted_bench_keeps_what_it_has(foggy, tmp_path, monkeypatch):
         measure_renderings(*given, save=save_and_stop, **named)
 
     monkeypatch.setattr(measurement, "measure_renderings", interrupted)
+    (tmp_path / "bench" / ".training").mkdir(parents=True)  # of a bench of a scene that was killed
     result = nerfcli("bench", foggy, "--budget", "60s", "--threads", "2", "-o", tmp_path / "bench")
     assert (result.exit_code, result.stdout) == (INTERRUPTED, "")
     content = json.loads((tmp_path / "bench" / "bench.json").read_text())
@@ -218,7 +222,7 @@ def test_a_bench_of_a_scene_trains_it(spheres, tmp_path, monkeypatch):
     saved: list[list[Point]] = []
     how = {"resources": Resources(2, "cpu"), "seconds": 60.0}
     measurement.measure_trainings(
-        spheres.root, tmp_path, **how, save=lambda points: saved.append(list(points)), tell=lambda *progress: None
+        spheres, tmp_path, **how, save=lambda points: saved.append(list(points)), tell=lambda *progress: None
     )
     assert [[point.name for point in points] for points in saved] == [["default"], ["default", "seed 1"]]
     assert all((point.steps, point.levels_off) == (2, None) and np.isfinite(point.psnr) for point in saved[-1])
@@ -234,3 +238,7 @@ def test_what_cannot_be_measured_is_reported(tmp_path, foggy):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     assert "is not a bench folder" in error_of(nerfcli("bench", foggy, "-o", tmp_path / "mine"))[0]
+    (tmp_path / "mine" / "bench.json").write_text('{"complete": true}')
+    error, hint = error_of(nerfcli("bench", foggy, "-o", tmp_path / "mine"))
+    assert "it has no source_sha256" in error
+    assert "--overwrite" in hint

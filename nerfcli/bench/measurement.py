@@ -22,7 +22,7 @@ import torch
 
 from nerfcli import machine
 from nerfcli.bench.results import Point, spread
-from nerfcli.captures.loading import load_scene
+from nerfcli.captures.capture import Capture
 from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import compare
 from nerfcli.evaluate.photos import HeldOutPhoto, background_of, held_out_photos, paired
@@ -195,8 +195,8 @@ LEAST_ROUNDS, MOST_ROUNDS = 3, 9
 LEAST_SETTINGS = 7
 # A rendering counts as converged with steps this many times as fine, and next to nothing left out by the early stop.
 FINER = 8
-# Seconds of a training besides the training: photos, preparation, comparison with held-out photos.
-_WORK = ".training"
+# Subfolder for the run that is being measured; a killed bench leaves it.
+WORK = ".training"
 
 # Called with the points so far, after each round of renderings and after each training.
 Save = Callable[[Sequence[Point]], None]
@@ -265,7 +265,7 @@ def measure_renderings(run: Run, *, resources: Resources, seconds: float, save: 
 
 
 def measure_trainings(
-    scene_folder: Path, work: Path, *, resources: Resources, seconds: float, save: Save, tell: Tell
+    scene: Capture, work: Path, *, resources: Resources, seconds: float, save: Save, tell: Tell
 ) -> None:
     """Train a scene with as many settings as time allows, each for the same time unless it is the time that varies.
 
@@ -275,14 +275,13 @@ def measure_trainings(
     Raises:
         UserError: see `nerfcli.training.loop.train`; or nothing was held out.
     """
-    scene = load_scene(scene_folder)
     if not scene.test_frames:
-        raise UserError(f"{scene_folder} has no held-out photos", "by default every 8th photo is held out")
+        raise UserError(f"{scene.root} has no held-out photos", "by default every 8th photo is held out")
     device = resources.torch_device
     base = TrainSettings(device=device, threads=resources.cores, **sizes_for(device))
     chosen, unit = affordable(train_settings(), seconds, overhead=6.0)
     points: list[Point] = []
-    memory, folder = PeakMemory(device), work / _WORK
+    memory, folder = PeakMemory(device), work / WORK
     for number, setting in enumerate(chosen):
 
         def on_progress(progress: Progress, number: int = number, name: str = setting.name) -> None:

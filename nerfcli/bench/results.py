@@ -55,7 +55,7 @@ def spread(seconds: Sequence[float]) -> dict[str, Any]:
 
 
 def pareto(points: Sequence[Point]) -> set[str]:
-    """Return the names of the points than which none is faster with as small an error, or better as fast."""
+    """Return the names of the points that no other beats in time or error without being worse in the other."""
     best, names = float("inf"), set()
     for point in sorted(points, key=lambda point: (point.seconds, point.error)):
         if point.error < best:

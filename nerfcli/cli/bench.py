@@ -1,6 +1,5 @@
 """nerfcli bench: speed against error."""
 
-import json as json_text
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -39,7 +38,7 @@ def bench(
     Run nothing else meanwhile.
 
     Writes SOURCE-bench/ with bench.csv, bench.json and a plot, bench.png; after an interruption they hold the results
-    so far. In the column "fastest" are the settings than which none is faster with as small an error.
+    so far. The column "fastest" marks the settings that no other beats in both speed and error.
 
     \b
     Examples:
@@ -64,28 +63,41 @@ def bench_one(path: Path, output: Output, seconds: float, *, resources: Resource
     """Measure one run or scene, or keep a complete bench of it; return the content of bench.json.
 
     Raises:
-        UserError: the input cannot be measured, or the output folder holds something else.
+        UserError: the input cannot be measured, or the output folder holds something else, such as another bench.
     """
     from nerfcli import kernels
-    from nerfcli.bench.measurement import describe_machine, is_busy, load_average, measure_renderings, measure_trainings
+    from nerfcli.atomic import read_json
+    from nerfcli.bench import measurement
     from nerfcli.bench.results import BENCH, COLUMNS, Point, table_of, write_results
+    from nerfcli.captures.loading import fingerprint, load_scene
     from nerfcli.training.runs.run import Run
 
     folder = output.beside(path, "-bench")
     if not path.exists():
         raise UserError(f"{path} does not exist", "give a run folder, or a scene folder")
-    if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / BENCH).is_file()):
+    others = folder.is_dir() and any(entry.name != measurement.WORK for entry in folder.iterdir())
+    if folder.is_file() or (others and not (folder / BENCH).is_file()):
         raise UserError(f"{folder} exists and is not a bench folder", "choose another folder with -o")
-    if not output.overwrite and (folder / BENCH).is_file():
-        content = json_text.loads((folder / BENCH).read_text(encoding="utf-8"))
-        if content["complete"]:
-            console.note(f"{folder} is complete; add --overwrite to measure again")
-            return content
-    if is_busy(load := load_average()):
+    run = Run(path)
+    scene = None if run.is_trained else load_scene(path)
+    wanted = {
+        "source_sha256": run.checkpoint_sha256() if scene is None else fingerprint(scene),
+        "budget_seconds": seconds,
+        "machine": measurement.describe_machine(resources.torch_device, resources.cores),
+    }
+
+    def earlier() -> dict[str, Any]:
+        hint = "add --overwrite to measure again, or choose another folder with -o"
+        return read_json(folder / BENCH, needed=("complete", *wanted), hint=hint)
+
+    if output.keeps(folder / BENCH, lambda: wanted.items() <= earlier().items()) and earlier()["complete"]:
+        console.note(f"{folder} is complete; add --overwrite to measure again")
+        return earlier()
+    load = measurement.load_average()
+    if measurement.is_busy(load):
         console.warn(f"other programs use the processors (load average {load:.1f}): times will be too long and vary")
     kernels.prepare(console.note, resources.torch_device)
-    machine = describe_machine(resources.torch_device, resources.cores)
-    about = {"source": str(path), "machine": machine, "load_average": load}
+    about = {"source": str(path), **wanted, "load_average": load}
     how = {"resources": resources, "seconds": seconds}
     latest: list[Point] = []
 
@@ -94,10 +106,10 @@ def bench_one(path: Path, output: Output, seconds: float, *, resources: Resource
         write_results(folder, about, latest, complete=False)
 
     with console.stage(f"bench {path.name}") as reporter:
-        if Run(path).is_trained:
-            measure_renderings(Run(path), **how, save=save, tell=reporter.progress)
+        if scene is None:
+            measurement.measure_renderings(run, **how, save=save, tell=reporter.progress)
         else:
-            measure_trainings(path, folder, **how, save=save, tell=reporter.progress)
+            measurement.measure_trainings(scene, folder, **how, save=save, tell=reporter.progress)
     content = write_results(folder, about, latest, complete=True)
     console.table(COLUMNS, table_of(latest), styles=_STYLES)
     return content
