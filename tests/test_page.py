@@ -4,6 +4,7 @@ import base64
 import json
 import os
 import re
+import shlex
 import shutil
 import zlib
 from collections.abc import Iterator
@@ -78,7 +79,7 @@ def page_of(model: Model, frames: list[Frame], proof: Proof) -> str:
     photos = PagePhotos([], 0)
     numbers = PageNumbers.of(pack_model(model), proof, UNSEEN)
     box = (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
-    scene = scene_of(model, run=Path("a-run"), frames=frames, photos=photos.entries, box=box)
+    scene = scene_of(model, run=Path("a run"), frames=frames, photos=photos.entries, box=box)
     return page_html(scene, numbers)
 
 
@@ -351,6 +352,9 @@ def test_the_browser_draws_other_fields(field, sky, browser, tmp_path):
     assert found["colour"]["percentile_99"] <= COLOUR_BOUND
     assert found["median"]["median"] <= 1e-3
     assert found["colour"]["numbers"] == 2 * 3 * WIDTH * HEIGHT
+    browser.run("(nerfcliPage.boxChanged(), nerfcliPage.listKeys())")
+    for name in ("command", "render"):  # as a shell reads them
+        assert shlex.split(browser.run(f"document.getElementById('{name}').textContent"))[2] == "a run"
 
 
 def test_keys_move_turn_and_choose_what_is_shown(opened):
@@ -371,7 +375,8 @@ def test_keys_move_turn_and_choose_what_is_shown(opened):
 
 
 def test_the_address_holds_the_view(opened, spheres_page):
-    opened.key("4")
+    opened.key("8")
+    opened.run("$('share').value = 0.7, $('share').dispatchEvent(new Event('change'))")
     opened.drag((60, 60), (80, 70))
     opened.wait("nerfcliPage.done")
     fragment = opened.run("location.hash")
@@ -379,7 +384,7 @@ def test_the_address_holds_the_view(opened, spheres_page):
     opened.open(spheres_page, fragment)
     np.testing.assert_allclose(opened.run("nerfcliPage.walk.place"), place, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(opened.run("nerfcliPage.walk.turn"), turn, atol=1e-5)
-    assert opened.run("document.getElementById('map').value") == "median"
+    assert opened.run("[$('map').value, $('share').value, state.share]") == ["quantile", "0.7", 0.7]
 
 
 def test_a_photo_is_stood_at_wiped_over_and_subtracted(opened):

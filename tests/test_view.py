@@ -38,7 +38,7 @@ from nerfcli.training.runs.files import FIELD
 from nerfcli.training.runs.run import Run
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.viewer import painter
-from nerfcli.viewer.packing import pack_model
+from nerfcli.viewer.packing import PackedField, pack_model
 from nerfcli.viewer.painter import Painter, Tile, View, render_tile, strides_of, tiles_of, view_from_json
 from nerfcli.viewer.pictures import view_of
 from nerfcli.viewer.server import Address, PageServer
@@ -295,10 +295,19 @@ def test_the_page_may_fetch_from_its_server_alone(served):
     assert served.get("photo?n=0&px=40")[:2] == b"\xff\xd8"
 
 
-def test_the_field_comes_as_the_static_page_has_it(served):
+def test_the_field_comes_as_the_static_page_has_it(served, monkeypatch):
+    packed_models: list[Model] = []
+
+    def counted(model: Model) -> PackedField:
+        packed_models.append(model)
+        return pack_model(model)
+
+    monkeypatch.setattr("nerfcli.workflows.view.pack_model", counted)
     content = served.get("field")
     length = struct.unpack("<I", content[:4])[0]
     head = json.loads(content[4 : 4 + length])
+    served.get()
+    assert len(packed_models) == 1  # for the page and its field
     packed = pack_model(Run(served.show._path).model())
     assert head["field"] == packed.field
     assert content[4 + length :] == b"".join(array.tobytes() for array in packed.arrays.values())
@@ -422,6 +431,12 @@ def test_a_browser_without_a_graphics_card_shows_what_the_server_renders(trained
         assert seen.mean() > 0.9
         off, still = (np.abs(other - moved)[seen].mean() for other in (warped, drawn))
         assert off < 0.5 * still
+        # A request that fails is repeated.
+        browser.run(
+            "(() => { const real = fetch; globalThis.fetch = async place => { globalThis.fetch = real; "
+            "throw new Error('lost'); }; nerfcliPage.walk.move(0.1, 0, 0); nerfcliPage.moved(); })()"
+        )
+        browser.wait("nerfcliPage.done", seconds=30.0)
         assert not browser.errors
 
 
@@ -437,12 +452,12 @@ def test_a_browser_draws_each_new_field_by_itself(finished, tmp_path):
             finished / FIELD,
             replace(old, background=(0.0, 0.5, 1.0), occupied=foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.0))),
         )
-        browser.wait("document.body.dataset.version == 2")
-        browser.wait("nerfcliPage.done")
-        browser.run("nerfcliPage.check()")
+        browser.run("nerfcliPage.check()")  # before the page has asked for a newer field
         found = json.loads(browser.run("document.getElementById('checked').dataset.found"))
         assert found["colour"]["largest"] < 2e-3
         assert found["opacity"]["largest"] < 2e-3
+        browser.wait("document.body.dataset.version == 2")
+        browser.wait("nerfcliPage.done")
         corner = browser.run("nerfcliPage.probe.colour.slice(0, 4)")
         assert corner["2"] > corner["0"]
         assert not browser.errors

@@ -21,12 +21,20 @@ async function fetchField(scene) {
   const { head, arrays } = await fetchArrays("field");
   Object.assign(scene, { field: head.field, march: head.march });
   withField(scene, arrays);
-  return head.version;
+  scene.version = head.version;
 }
 
+async function drawNewest(page) {
+  await fetchField(page.scene);
+  if (!page.renderer.gl.isContextLost()) page.renderer.load();
+  page.request();
+}
+
+/** Fetch the proof of the newest field; return that field's version. */
 async function fetchProof(scene) {
   const { head, arrays } = await fetchArrays("proof");
   Object.assign(scene, { proof: head.proof, expected: new Float32Array(arrays.expected.buffer) });
+  return head.version;
 }
 
 /** Who draws: "page" or "server", and why. */
@@ -45,9 +53,10 @@ function drawerOf({ refusal }) {
 
 async function startLive(scene) {
   const [by, why] = drawerOf(scene.live);
-  let page, { version } = scene.live;
+  let page;
+  scene.version = scene.live.version;
   try {
-    if (by === "page") version = await fetchField(scene);
+    if (by === "page") await fetchField(scene);
     else Object.assign(state, { scale: 0.5 });
     page = by === "page" ? startHere(scene) : show(scene, new Remote(scene, $("field")));
   } catch (error) {
@@ -62,22 +71,23 @@ async function startLive(scene) {
   $("scale").value = state.scale;
   $("proof").hidden = by === "server";
   if (by === "server") Object.assign($("clip"), { disabled: true, title: "only where this device draws" });
-  follow(page, by, version);
+  follow(page, by);
 }
 
 /** Show each newer field; of those that the server draws, when the picture of the one before is complete. */
-async function follow(page, by, version) {
+async function follow(page, by) {
+  const { scene } = page;
   for (;;) {
-    document.body.dataset.version = version;
+    document.body.dataset.version = scene.version;
     await new Promise(resolve => setTimeout(resolve, POLL_MS));
     try {
       const newest = await (await fetch("version")).json();
-      if (newest === version || by === "server" && !page.done) continue;
-      if (by === "page") {
-        version = await fetchField(page.scene);
-        if (!page.renderer.gl.isContextLost()) page.renderer.load();
-      } else version = page.renderer.version = newest;
-      page.request();
+      if (newest === scene.version || by === "server" && !page.done) continue;
+      if (by === "page") await drawNewest(page);
+      else {
+        scene.version = page.renderer.version = newest;
+        page.request();
+      }
     } catch (error) {
       $("status").textContent = `no newer field from the server: ${error.message}`;
     }

@@ -322,7 +322,7 @@ class Page {
     state.box.forEach((value, i) => { if (inputs[i] !== document.activeElement) inputs[i].value = Number(value.toPrecision(5)); });
     $("numbers").hidden = $("command-line").hidden = !state.showBox;
     const listed = state.box.map(v => Number(v.toPrecision(6))).join(",");
-    $("command").textContent = `nerfcli export ${this.scene.run} --to mesh --box=${listed}`;
+    $("command").textContent = `nerfcli export ${this.scene.run_in_shell} --to mesh --box=${listed}`;
     if (state.clip) this.request();
     else this.decorate();
   }
@@ -347,7 +347,7 @@ class Page {
       return item;
     }));
     $("render-line").hidden = !state.keyframes.length;
-    $("render").textContent = `nerfcli render ${this.scene.run} --cameras camera_path.json --video`;
+    $("render").textContent = `nerfcli render ${this.scene.run_in_shell} --cameras camera_path.json --video`;
   }
 
   play() {
@@ -373,7 +373,8 @@ class Page {
   }
 
   async check() {
-    if (this.scene.live) await fetchProof(this.scene);
+    // The proof is of the newest field, which this page may not draw yet.
+    while (this.scene.live && await fetchProof(this.scene) !== this.scene.version) await drawNewest(this);
     const found = compare(this.renderer, this.scene), table = $("checked");
     const rows = [["map", "largest", "99 %", "rms"], ...Object.entries(found).map(([map, f]) =>
       [map, ...[f.largest, f.percentile_99, f.rms].map(v => v.toExponential(1))])];
@@ -393,8 +394,10 @@ class Page {
 
   fromAddress() {
     const parameters = new URLSearchParams(location.hash.slice(1)), map = this.maps.indexOf(parameters.get("m"));
-    if (map >= 0) this.choose(map);
+    const share = Number(parameters.get("s"));
     if (["z", "ray"].includes(parameters.get("a"))) $("axis").value = state.axis = parameters.get("a");
+    if (share >= 0.01 && share <= 0.99) $("share").value = state.share = share;
+    if (map >= 0) this.choose(map);
     this.walk.read(parameters);
   }
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import up_direction
+from nerfcli.errors import in_shell
 from nerfcli.pages import page
 from nerfcli.photos.colours import levels_of
 from nerfcli.render.model import Model
@@ -78,14 +79,15 @@ def scene_of(
         photos: entries of `pictures`.
         box: low and high corner of the initial crop box, scene units.
     """
-    size = 1.0 / model.training_from_scene.scale
+    name, size = run.resolve().name, 1.0 / model.training_from_scene.scale
     home = view_of(frames[len(frames) // 2])
     unit = {"metre": "metres", "arbitrary": "arbitrary units"}.get(model.unit, model.unit)
     source = f" ({model.unit_source})" if model.unit_source else ""
     held_out = sum(entry["split"] == "test" for entry in photos)
     return {
         "format": FORMAT,
-        "run": run.resolve().name,
+        "run": name,
+        "run_in_shell": in_shell(Path(name)),
         "about": f"nerfcli {__version__}, field {str(model.sha256)[:12]}. Lengths in {unit}{source}, in the frame of "
         f"the scene. {len(photos)} photos, {held_out} held out.",
         "unit": model.unit,

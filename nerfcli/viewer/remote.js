@@ -37,6 +37,7 @@ class Remote {
         if (error.name === "AbortError") continue;
         $("status").textContent = `no picture from the server: ${error.message}`;
         await new Promise(resolve => setTimeout(resolve, 1000));
+        this.wanted ||= view;
       }
     }
     this.running = false;

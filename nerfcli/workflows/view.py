@@ -97,7 +97,7 @@ class RunData:
         run, frames = Run(self._path), self._frames()
         photos = fetched_photos(run.exposures, run.cameras.train, run.cameras.test)
         scene = scene_of(model, run=self._path, frames=frames, photos=photos, box=_box(model, frames))
-        return live_page_html(scene, version=version, refusal=_refusal(model), far=model.marching.far)
+        return live_page_html(scene, version=version, refusal=self._refusal(), far=model.marching.far)
 
     def field(self) -> bytes:
         version, model = self.model()
@@ -109,8 +109,9 @@ class RunData:
             return self._encoded[1]
 
     def proof(self) -> bytes:
-        proof = make_proof(self.model()[1], self._frames())
-        return _bytes({"proof": proof.description}, {"expected": proof.expected})
+        version, model = self.model()
+        proof = make_proof(model, self._frames())
+        return _bytes({"version": version, "proof": proof.description}, {"expected": proof.expected})
 
     def photo(self, index: int, longest_px: int) -> bytes:
         cameras = Run(self._path).cameras
@@ -134,6 +135,14 @@ class RunData:
                 self._loaded = version, load_model(path, "cpu")
             return self._loaded
 
+    def _refusal(self) -> str | None:
+        """Return the reason why a page cannot draw the field by itself; None if it can."""
+        try:
+            self.field()
+        except UserError as error:
+            return error.message
+        return None
+
     def _frames(self) -> list[Frame]:
         cameras = Run(self._path).cameras
         return [pinhole_frame(frame) for frame in (*cameras.train, *cameras.test)]
@@ -154,15 +163,6 @@ def _bytes(description: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> byt
     head = json.dumps({**description, "arrays": listed}, allow_nan=False).encode()
     body = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays.values())
     return struct.pack("<I", len(head)) + head + body
-
-
-def _refusal(model: Model) -> str | None:
-    """Return the reason why a page cannot draw a field by itself; None if it can."""
-    try:
-        pack_model(model)
-    except UserError as error:
-        return error.message
-    return None
 
 
 def _box(model: Model, frames: Sequence[Frame]) -> tuple[float, ...]:
