@@ -1,7 +1,9 @@
 """The server of the interactive page: who may look, and what they get, during a training too."""
 
+import errno
 import json
 import re
+import shlex
 import signal
 import socket
 import struct
@@ -42,7 +44,7 @@ from nerfcli.viewer.packing import PackedField, pack_model
 from nerfcli.viewer.painter import Painter, Tile, View, render_tile, strides_of, tiles_of, view_from_json
 from nerfcli.viewer.pictures import view_of
 from nerfcli.viewer.server import Address, PageServer
-from nerfcli.workflows.view import RunData
+from nerfcli.workflows.view import RunData, view_run
 
 FEW = TrainSettings(
     budget_seconds=None, steps=12, samples_per_step=2**10, log2_rows=10, threads=2, downscale=8, model="default"
@@ -346,6 +348,36 @@ def test_a_port_in_use_is_reported_or_skipped(finished):
     show = RunData(finished, Resources(1))
     with PageServer(show, Address()) as one, PageServer(show, Address()) as two:
         assert one.port < two.port
+
+
+def test_a_port_that_is_not_permitted_is_reported_as_such(finished, monkeypatch):
+    def refuse(server: PageServer) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")  # as Linux does below port 1024
+
+    monkeypatch.setattr(PageServer, "server_bind", refuse)
+    error, _ = error_of(nerfcli("view", finished, "--port", "80", "--no-browser"))
+    assert error == "Error: port 80 of 127.0.0.1 is denied by the system, as ports below 1024 often are"
+
+
+@pytest.mark.parametrize(
+    ("host", "reached"),
+    [("0.0.0.0", "127.0.0.1"), ("localhost", "localhost"), ("::1", "[::1]"), ("::", "[::1]")],
+)
+def test_the_ssh_command_leads_to_the_printed_address_without_a_user_name_too(finished, monkeypatch, host, reached):
+    """As in a container whose user has no entry in /etc/passwd."""
+    monkeypatch.setattr("getpass.getuser", lambda: {}["uid 1234"])
+    monkeypatch.setattr(PageServer, "server_bind", lambda server: setattr(server, "server_address", (host, 8123)))
+    monkeypatch.setattr(PageServer, "server_activate", lambda server: None)  # IPv6 may be missing
+    told: list[str] = []
+
+    def on_ready(url: str, from_elsewhere: str) -> None:
+        told.extend((url, from_elsewhere))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        view_run(finished, Address(host), on_ready=on_ready)
+    assert told[0].startswith(f"http://{reached}:8123/")
+    assert shlex.split(told[1]) == ["ssh", "-L", f"8123:{reached}:8123", socket.gethostname()]
 
 
 def test_an_address_of_another_machine_is_refused(finished):

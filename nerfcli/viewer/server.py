@@ -7,6 +7,7 @@ import socket
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from errno import EACCES, EADDRINUSE
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Protocol
@@ -91,7 +92,8 @@ class PageServer(ThreadingHTTPServer):
                 super().__init__((host, candidate), _Handler)
                 break
             except OSError as error:
-                if candidate == ports[-1] or not _is_taken(error):
+                # Windows answers EACCES for some ports that are in use.
+                if candidate == ports[-1] or error.errno not in (EADDRINUSE, EACCES):
                     raise _cannot_listen(host, candidate, error) from error
 
     @property
@@ -204,17 +206,11 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing for each request."""
 
 
-def _is_taken(error: OSError) -> bool:
-    from errno import EACCES, EADDRINUSE
-
-    return error.errno in (EADDRINUSE, EACCES)
-
-
 def _cannot_listen(host: str, port: int, error: OSError) -> UserError:
-    if _is_taken(error):
-        return UserError(
-            f"port {port} of {host} is in use", "choose another one, or omit --port to use the next free one"
-        )
+    if error.errno in (EADDRINUSE, EACCES):
+        problem = "is in use" if error.errno == EADDRINUSE else "is denied by the system, as ports below 1024 often are"
+        hint = "choose another one, or omit --port to use the next free one"
+        return UserError(f"port {port} of {host} {problem}", hint)
     return UserError(
         f"cannot listen on {host}: {error.strerror or error}", "give an address of this machine with --host"
     )

@@ -3,6 +3,7 @@
 import getpass
 import json
 import os
+import shlex
 import socket
 import struct
 import sys
@@ -51,11 +52,10 @@ def view_run(
     path = Path(run)
     if not (path / CONFIG).exists():
         raise no_run(path)
-    host = address.host
-    local = host in (LOCAL, "0.0.0.0", "::", "::1", "localhost")
+    host = {"0.0.0.0": LOCAL, "::": "::1"}.get(address.host, address.host)
     with PageServer(RunData(path, resources), address) as server:
-        url = server.url(LOCAL if host in ("0.0.0.0", "::") else host)
-        on_ready(url, _from_elsewhere(server.port) if local else "")
+        local = host in (LOCAL, "::1", "localhost")
+        on_ready(server.url(host), _from_elsewhere(host, server.port) if local else "")
         server.serve_forever()
 
 
@@ -66,8 +66,14 @@ def open_browser(url: str) -> None:
         webbrowser.open(url)
 
 
-def _from_elsewhere(port: int) -> str:
-    return f"ssh -L {port}:{LOCAL}:{port} {getpass.getuser()}@{socket.gethostname()}"
+def _from_elsewhere(host: str, port: int) -> str:
+    """Return the command that makes an address of this machine reachable from another one."""
+    try:
+        user = f"{getpass.getuser()}@"
+    except (KeyError, OSError):  # a container's user may have no name
+        user = ""
+    forward = shlex.quote(f"{port}:{f'[{host}]' if ':' in host else host}:{port}")
+    return f"ssh -L {forward} {user}{socket.gethostname()}"
 
 
 class RunData:
