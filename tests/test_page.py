@@ -466,7 +466,7 @@ def test_a_lost_context_is_reported_and_restored(opened):
         "globalThis.lose = nerfcliPage.renderer.gl.getExtension('WEBGL_lose_context'); globalThis.lose.loseContext()"
     )
     opened.wait("!document.getElementById('trouble').hidden")
-    assert "graphics device" in opened.run("document.getElementById('trouble').textContent")
+    assert "graphics context" in opened.run("document.getElementById('trouble').textContent")
     opened.run("globalThis.lose.restoreContext()")
     opened.wait("document.getElementById('trouble').hidden")
     opened.wait(f"document.body.dataset.rested > {count}")

@@ -1,1 +1,1 @@
-"""Write rendered frames to files: settings, files of one frame, all frames, videos."""
+"""Geometry from a field: depth maps of its views, fused to meshes or points, and the files that hold them."""

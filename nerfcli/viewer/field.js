@@ -5,7 +5,6 @@ const MAPS = ["colour", "opacity", "conditional", "median", "max-weight", "momen
   "disagreement", "coverage", "parallax"];
 // Maps that are no lengths: ends of their colours, and what follows the last number of the legend.
 const COUNTS = { opacity: [[0, 1], ""], coverage: [[0, 8], " or more photos"], parallax: [[0, 30], " degrees or more"] };
-const ROWS = "RGBA16I";
 
 /** All that the page was made with. */
 async function readScene() {

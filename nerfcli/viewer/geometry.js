@@ -21,16 +21,6 @@ function aboutAxis(axis, angle) {
     [z * x * k - y * s, z * y * k + x * s, c + z * z * k]];
 }
 
-/** A turn that looks ahead with its down as far as possible against `up`. */
-function looking(ahead, up) {
-  const z = unit(ahead);
-  let x = cross(z, scaled(up, -1));
-  x = scaled(x, -1);
-  if (norm(x) < 1e-6) x = cross(z, Math.abs(z[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]);
-  x = unit(x);
-  return fromColumns(x, cross(z, x), z);
-}
-
 /** The nearest orthonormal columns, after many small turns. */
 function orthonormal(turn) {
   const z = unit(column(turn, 2)), x = unit(added(column(turn, 0), z, -dot(column(turn, 0), z)));

@@ -34,7 +34,7 @@ function startHere(scene) {
   const canvas = $("field");
   canvas.addEventListener("webglcontextlost", event => {
     event.preventDefault();
-    trouble("The graphics device took its memory back. The page goes on by itself as soon as it gets it again.");
+    trouble("The browser lost its graphics context; the page continues once it is restored.");
   });
   const begin = () => {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, powerPreference: "high-performance" });
@@ -253,17 +253,17 @@ class Page {
   async signedError(view, fine) {
     const photo = this.scene.photos[state.photo], image = $("photo");
     if (!photo?.picture) return;
+    const box = this.photoBox(view);
     await image.decode();
     const width = image.naturalWidth, height = image.naturalHeight, canvas = $("error");
     Object.assign(canvas, { width, height });
     const context = canvas.getContext("2d", { willReadFrequently: true });
     context.drawImage(image, 0, 0);
     const pixels = context.getImageData(0, 0, width, height), [colour] = this.renderer.read(fine), gains = this.gains();
-    const scale = view.lens[1] / photo.lens[1], left = view.lens[2] - photo.lens[2] * scale;
-    const top = view.lens[3] - photo.lens[3] * scale, each = photo.width * scale / width;
+    const each = box.width / width;
     let sum = 0, count = 0;
     for (let y = 0; y < height; y++) for (let x = 0; x < width; x++) {
-      const i = 4 * (y * width + x), u = Math.floor(left + (x + 0.5) * each), v = Math.floor(top + (y + 0.5) * each);
+      const i = 4 * (y * width + x), u = Math.floor(box.left + (x + 0.5) * each), v = Math.floor(box.top + (y + 0.5) * each);
       if (u < 0 || v < 0 || u >= view.width || v >= view.height) { pixels.data[i + 3] = 0; continue; }
       let off = 0;
       for (let c = 0; c < 3; c++) {
@@ -298,7 +298,7 @@ class Page {
   pick(x, y) {
     const point = this.pointAt(x, y);
     if (!point) {
-      $("distance").textContent = "Less than half of the light ends there: no point to measure from.";
+      $("distance").textContent = "Less than half of the light is absorbed there, so there is no point to measure from.";
       return;
     }
     state.points = state.points.length === 2 ? [point] : [...state.points, point];
@@ -310,9 +310,9 @@ class Page {
   distanceInWords(a, b) {
     const apart = norm(added(a.middle, b.middle, -1)), ends = ["low", "middle", "high"];
     const all = ends.flatMap(i => ends.map(k => a[i] && b[k] ? norm(added(a[i], b[k], -1)) : NaN)).filter(Number.isFinite);
-    const open = !a.high || !b.high ? " or more: not all light ends there" : "";
+    const open = !a.high || !b.high ? " or more: not all light is absorbed there" : "";
     return `${apart.toPrecision(4)} ${this.unit}; ${Math.min(...all).toPrecision(4)} to ${Math.max(...all).toPrecision(4)}${open} `
-      + "where 5 to 95 % of the light end";
+      + "over the range in which 5 to 95 % of the light is absorbed";
   }
 
   // Box and path

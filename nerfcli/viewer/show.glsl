@@ -4,7 +4,7 @@ uniform sampler2D fineColour, fineEnds, fineShares, coarseColour, coarseEnds, co
 uniform sampler2D colours;     // the colour map, 256 x 1
 uniform vec4 lens;
 uniform vec2 size, coarseSize;
-uniform int map;               // which, see MAPS in state.js
+uniform int map;               // which, see MAPS in field.js
 uniform bool alongAxis;        // z instead of the distance along the ray
 uniform float sceneUnits;      // per unit of the training frame
 uniform vec2 range;            // of the colours

@@ -1,1 +1,1 @@
-"""Files of photos (`images`), depth maps with their definition (`depth_pictures`), videos, meshes and volumes."""
+"""Files of rendered frames: depth maps with their definition, videos, and the facts that such files state."""
