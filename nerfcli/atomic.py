@@ -4,11 +4,14 @@ Everything is written under a hidden name beside its destination and renamed whe
 command or a full disk leaves nothing behind that a later command would take for a result.
 """
 
+import functools
 import hashlib
 import json
 import os
 import re
 import shutil
+import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from errno import EDQUOT, EFBIG, ENOSPC
@@ -19,7 +22,23 @@ from nerfcli.errors import UserError
 from nerfcli.machine import is_running
 
 # Leftovers of a killed process: a partial result, or an old result that it had just moved aside.
-_LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<kind>partial|old)-(?P<process>\d+)(\D.*)?", re.DOTALL)
+_LEFTOVER = re.compile(
+    r"\.(?P<name>.+)\.(?P<kind>partial|old)-(?P<host>[0-9a-f]{6})-(?P<process>\d+)(\D.*)?", re.DOTALL
+)
+# Several machines may write into one folder, and know only their own processes. After this time, the leftovers of
+# another machine, such as a container that has ended, count as such.
+_ABANDONED_S = 48 * 3600.0
+
+
+@functools.cache
+def _host() -> str:
+    """Return what tells this machine from others, as six characters."""
+    return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:6]
+
+
+def _own() -> str:
+    """Return what tells this process from others, on this machine and on others."""
+    return f"{_host()}-{os.getpid()}"
 
 
 @contextmanager
@@ -29,7 +48,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     Raises:
         UserError: the folder cannot be created or written, or the disk is full.
     """
-    partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
+    partial = path.with_name(f".{path.stem}.partial-{_own()}{path.suffix}")
     with _write_errors_explained(path):
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -50,7 +69,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         UserError: as for `atomic_path`.
     """
     path = path.absolute()  # "." has no name
-    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
+    partial = path.with_name(f".{path.name}.partial-{_own()}")
     with _write_errors_explained(path):
         try:
             clear_leftovers(path.parent)
@@ -67,7 +86,7 @@ def replace_folder(complete: Path, path: Path) -> None:
     Raises:
         UserError: it cannot be moved.
     """
-    old = path.with_name(f".{path.name}.old-{os.getpid()}")
+    old = path.with_name(f".{path.name}.old-{_own()}")
     with _write_errors_explained(path):
         try:
             clear_leftovers(path.parent)
@@ -88,10 +107,15 @@ def clear_leftovers(folder: Path) -> None:
     restored if nothing has replaced them. Files of running processes are kept."""
     hidden = [path.name for path in folder.glob(".*")]
     for match in map(_LEFTOVER.fullmatch, hidden):
-        if match is None or is_running(int(match["process"])):
+        if match is None:
             continue
         path, place = folder / match.string, folder / match["name"]
         with suppress(OSError):  # another command is doing the same, or the file does no harm
+            if match["host"] != _host():
+                if time.time() - path.stat().st_mtime < _ABANDONED_S:
+                    continue
+            elif is_running(int(match["process"])):
+                continue
             if match["kind"] == "old" and not place.exists():
                 os.replace(path, place)
             elif path.is_dir():

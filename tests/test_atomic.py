@@ -5,11 +5,13 @@ import math
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 from commands import listing
 
+from nerfcli import atomic
 from nerfcli.atomic import atomic_folder, atomic_path, clear_leftovers, read_json, replace_folder, write_json
 from nerfcli.errors import BAD_INPUT, UserError
 
@@ -126,11 +128,11 @@ def test_json_of_ours_that_is_damaged_is_reported(content, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def dead() -> int:
-    """The process id of a process that has ended."""
+def dead() -> str:
+    """What hidden files of a process that has ended have in their names."""
     with subprocess.Popen([sys.executable, "-c", ""]) as process:
         pass
-    return process.pid
+    return f"{atomic._host()}-{process.pid}"
 
 
 def test_leftovers_of_the_dead_are_cleared_and_those_of_the_living_stay(tmp_path, dead):
@@ -138,12 +140,24 @@ def test_leftovers_of_the_dead_are_cleared_and_those_of_the_living_stay(tmp_path
     (tmp_path / f".predictions.partial-{dead}" / "a.png").write_text("half")
     (tmp_path / f".field.partial-{dead}.safetensors").write_text("half")
     (tmp_path / f".rgb.partial-{dead}.gif-x7f").mkdir()
-    kept = {f".field.partial-{os.getpid()}.safetensors", ".theirs.partial-x", f"field.partial-{dead}", ".git"}
+    kept = {f".field.partial-{atomic._own()}.safetensors", ".theirs.partial-x", f"field.partial-{dead}", ".git"}
     for name in kept:
         (tmp_path / name).write_text("not ours")
     clear_leftovers(tmp_path)
     assert set(names(tmp_path)) == kept
     clear_leftovers(tmp_path / "nowhere")
+
+
+def test_what_another_machine_writes_stays_for_two_days(tmp_path, dead):
+    """Machines that share a folder know only their own processes."""
+    other = tmp_path / f".1-frames.partial-{'0' * 6}-{dead.partition('-')[2]}"
+    other.mkdir()
+    clear_leftovers(tmp_path)
+    assert other.exists()
+    two_days_ago = time.time() - 2 * 24 * 3600 - 1
+    os.utime(other, (two_days_ago, two_days_ago))
+    clear_leftovers(tmp_path)
+    assert not other.exists()
 
 
 def test_a_result_that_was_put_aside_comes_back_where_its_place_is_empty(tmp_path, dead):

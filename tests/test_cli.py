@@ -41,11 +41,14 @@ from nerfcli.output import Output
 from nerfcli.photos.images import read_image
 from nerfcli.photos.masks import write_masks
 from nerfcli.poses import structure_from_motion
+from nerfcli.render.depth import DepthRequest
 from nerfcli.render.files.float_maps import read_tiff
 from nerfcli.training import loop
 from nerfcli.training.loop import Progress
 from nerfcli.training.runs import settings
 from nerfcli.training.runs.files import append_log, read_log
+from nerfcli.training.runs.run import load_run
+from nerfcli.workflows import pipeline
 
 BATCH_COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench", "export")
 COMMANDS = (*BATCH_COMMANDS, "view")
@@ -189,6 +192,9 @@ def test_what_is_no_time(text):
         ("render x --background-distance 5", "it works with --depth background"),
         ("render x --outputs depth --rgba", "--rgba: it works with --outputs rgb"),
         ("render x --outputs rgb --depth median", "--depth: it works with --outputs depth"),
+        ("render x --outputs rgb --depth-axis ray", "--depth-axis: it works with --outputs depth"),
+        ("render x --outputs rgb --min-opacity 0.1", "--min-opacity: it works with --outputs depth"),
+        ("render x --splats y.ply --step 2", "--step works with a run, not with y.ply"),
         ("render x --count 20", "--count: it works with --cameras orbit, ellipse, spiral, interpolate"),
         ("train x --field mlp --log2-rows 12", "--log2-rows: it works with --field hash"),
         ("export x --to page --faces 100", "--faces: it is for meshes"),
@@ -488,6 +494,38 @@ def test_many_inputs_share_one_output_folder(capture, tmp_path):
     assert result.stdout.splitlines() == [str(tmp_path / "runs" / "spheres-run")]
 
 
+def test_results_of_inputs_of_one_name_do_not_replace_each_other(monkeypatch, tmp_path):
+    written = []
+    monkeypatch.setattr(
+        "nerfcli.workflows.export.export_run", lambda run, output, **more: written.append(output.path) or output.path
+    )
+    lines = "\n".join(("a/run", "b/run", "a/kitchen", "b/kitchen", "a/kitchen"))
+    result = nerfcli("export", "-", "--to", "points", "--overwrite", "-o", tmp_path, stdin=lines)
+    names = ("a-run-points.ply", "b-run-points.ply", "kitchen-points.ply", "kitchen-points.ply")
+    assert written == [tmp_path / name for name in names]  # the last one is the same input again
+    assert error_of(result)[0].endswith("is the result of a/kitchen, which has the same name")
+
+
+def test_a_batch_goes_on_after_paths_that_cannot_be_opened(finished, tmp_path):
+    """Too long for the system, not text, and evaluated one by one."""
+    result = nerfcli("info", "-", stdin=f"{'x' * 5000}\n{finished}\n")
+    assert result.exit_code == BAD_INPUT
+    assert "File name too long" in result.stderr
+    assert finished.name in result.stdout
+    result = nerfcli("evaluate", tmp_path / "missing", finished)
+    assert result.exit_code == BAD_INPUT
+    assert result.stdout.splitlines() == [str(finished / "metrics.json")]
+
+
+def test_export_adds_the_suffix_of_its_format(monkeypatch, tmp_path):
+    written = []
+    monkeypatch.setattr(
+        "nerfcli.workflows.export.export_run", lambda run, output, **more: written.append(output.path) or output.path
+    )
+    assert nerfcli("export", "x", "--to", "mesh", "--format", "glb", "-o", tmp_path / "kitchen").exit_code == 0
+    assert written == [tmp_path / "kitchen.glb"]
+
+
 @pytest.mark.parametrize("command", BATCH_COMMANDS)
 @pytest.mark.parametrize("stdin", ["", "\n\n"])
 def test_an_empty_batch_is_reported(command, stdin, tmp_path):
@@ -751,6 +789,44 @@ def test_run_trains_a_capture_with_the_poses_that_it_has(monkeypatch, capture, i
     assert result.stdout == ""
 
 
+def test_run_holds_out_what_is_asked_of_a_capture_and_refuses_options_of_poses(monkeypatch, capture):
+    rules = []
+
+    def only_asked(*given: object, holdout: str | None, **more: object) -> None:
+        rules.append(holdout)
+        raise UserError("enough", "of this test")
+
+    monkeypatch.setattr("nerfcli.workflows.pipeline.train_scene", only_asked)
+    for more in ((), ("--holdout", "block:0.15")):
+        nerfcli("run", capture, *more)
+    assert rules == [None, "block:0.15"]
+    for more in (("--frames", "9"), ("--quality", "best"), ("--subfolders",)):
+        refused = nerfcli("run", capture, *more)
+        assert refused.exit_code == 2
+        assert "has poses, which are used" in error_of(refused)[0]
+
+
+def test_run_makes_no_splats_of_panoramas(monkeypatch, capture, tmp_path):
+    """Stages with their arguments; a panorama is a camera of the run."""
+    stages = []
+    sphere = SimpleNamespace(camera=SimpleNamespace(is_spherical=True))
+    run = SimpleNamespace(
+        path=tmp_path / "run",
+        metrics_path=tmp_path / "run" / "metrics.json",
+        cameras=SimpleNamespace(train=[sphere]),
+        checkpoint_sha256=lambda: "",
+    )
+    monkeypatch.setattr(pipeline, "train_scene", lambda *given, **more: run)
+    monkeypatch.setattr(pipeline, "usual_depth", lambda run, views: DepthRequest("conditional", "z"))
+    for stage in ("evaluate_run", "evaluate_splats", "export_run", "report_runs"):
+        monkeypatch.setattr(pipeline, stage, lambda *given, stage=stage, **more: stages.append(stage))
+    monkeypatch.setattr(pipeline, "render_run", lambda *given, splats, **more: [tmp_path / str(splats)])
+    done = pipeline.run_pipeline(capture)
+    assert stages == ["evaluate_run", "report_runs"]
+    assert done.splats is None
+    assert done.renders == [tmp_path / "None"] * 2
+
+
 @pytest.mark.usefixtures("coarse_steps")
 def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch, capture, tmp_path):
     # Structure from motion has its own tests; here it finds the poses that the capture has.
@@ -800,6 +876,19 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
     (run / "metrics.json").unlink()  # the page now shows numbers that are gone
     nerfcli("evaluate", run)
     assert "report.html is kept" not in nerfcli(*arguments).stderr
+
+    longer = nerfcli(*("0.4s" if argument == "0.2s" else argument for argument in arguments))
+    assert longer.exit_code == 0, longer.stderr
+    assert f"resumed at step {load_run(run).log[-1]['step']}" not in longer.stderr
+    assert "resumed at step" in longer.stderr
+    assert longer.stdout == first.stdout
+    digest = load_run(run).checkpoint_sha256()
+    assert json.loads((run / "metrics.json").read_text())["checkpoint_sha256"] == digest
+    of_renders = [json.loads(path.read_text()) for path in run.glob("renders/*/render.json")]
+    assert [made["field_sha256"] for made in of_renders] == [digest] * 2
+    before = listing(run)
+    assert nerfcli(*arguments).exit_code == 0  # a smaller budget than that of the training, which is kept
+    assert listing(run) == before
 
 
 # Processes of their own

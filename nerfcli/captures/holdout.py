@@ -13,7 +13,6 @@ import re
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
-from nerfcli.captures.formats.fields import decoded
 from nerfcli.errors import UserError, several
 
 # By default, one of this many photos in the order of their names is held out.
@@ -100,6 +99,8 @@ def _in_order(name: str) -> list[tuple[int, int, str]]:
 
 
 def _listed(path: Path, present: frozenset[str], others: frozenset[str]) -> frozenset[str]:
+    from nerfcli.captures.formats.fields import decoded  # imports NumPy, which parsing a command line does not need
+
     try:
         lines = decoded(path.read_bytes()).splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -85,7 +85,7 @@ def main_options(version: bool = typer.Option(False, "--version", help="Show the
       ls -d captures/*/ | nerfcli poses - | nerfcli train - --budget 2m | nerfcli render -
 
     Exit codes: 0 done; 1 a bug; 2 wrong usage; 3 bad input; 4 too few photos registered; 5 numbers became
-    non-finite; 6 out of memory; 7 a quality gate not met or time limit reached; 8 another process of torchrun
+    non-finite; 6 out of memory; 7 a quality gate not met; 8 another process of torchrun
     ended; 130 interrupted; 143 ended by SIGTERM.
     """
     if version:

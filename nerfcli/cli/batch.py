@@ -1,8 +1,9 @@
 """Process one input, or several from standard input; refuse X-ray scans in commands for photos."""
 
+import io
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import typer
@@ -37,6 +38,7 @@ def refuse_scan(path: Path, command: str) -> None:
 
 
 STDIN = "-"
+_HINT = "check the path and its permissions"
 # Commands that read scenes, and those that read runs; the others read captures.
 _READ_SCENES, _READ_RUNS = ("train", "ablate"), ("evaluate", "render", "export", "report", "bench", "info")
 
@@ -48,10 +50,24 @@ class Given:
     Args:
         path: the file or folder.
         one_of_many: whether it is from standard input, so that an output is the folder of the results.
+        taken: the inputs so far, by their results.
     """
 
     path: Path
     one_of_many: bool = False
+    taken: dict[Path, Path] = field(default_factory=dict)
+
+    def refuse_taken(self, result: Path) -> None:
+        """Refuse a path that is also that of the result of another input; with --overwrite, only the last would stay.
+
+        Raises:
+            UserError: it is.
+        """
+        if (other := self.taken.setdefault(result, self.path)) != self.path:
+            raise UserError(
+                f"{result} is the result of {other}, which has the same name",
+                "give these inputs one by one, each with its own -o",
+            )
 
 
 def for_each_input(source: str, work: Callable[[Given], None], *, command: str) -> None:
@@ -69,24 +85,31 @@ def for_each_input(source: str, work: Callable[[Given], None], *, command: str) 
     """
     if source != STDIN:
         work(Given(Path(source)))
-        return
+    elif for_each_path(stdin_paths(), work, command=command) == 0:
+        raise no_paths(command)
+
+
+def for_each_path(paths: Iterable[Path], work: Callable[[Given], None], *, command: str) -> int:
+    """Call `work` for each path, see `for_each_input`, and return their number."""
     first_failure: UserError | None = None
-    count = 0
-    for path in stdin_paths():
+    taken, count = dict[Path, Path](), 0
+    for path in paths:
         count += 1
         try:
             with out_of_memory_explained():
                 if not command.startswith("ct "):
                     refuse_scan(path, command)
-                work(Given(path, one_of_many=True))
-        except UserError as error:
-            report_error(error, about=str(path))
-            first_failure = first_failure or error
+                work(Given(path, one_of_many=True, taken=taken))
+        except BrokenPipeError:
+            raise
+        except (UserError, OSError) as error:
+            failure = error if isinstance(error, UserError) else UserError(f"{path}: {error.strerror or error}", _HINT)
+            report_error(failure, about=str(path))
+            first_failure = first_failure or failure
         return_freed_memory()
-    if count == 0:
-        raise no_paths(command)
     if first_failure is not None:
         raise typer.Exit(first_failure.exit_code)
+    return count
 
 
 def no_paths(command: str) -> UserError:
@@ -103,6 +126,9 @@ def example_of_many(command: str) -> str:
 
 def stdin_paths() -> Iterator[Path]:
     """Yield the lines of standard input as paths, each as soon as it is complete; skip empty lines."""
+    for stream in (sys.stdin, sys.stdout):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="surrogateescape")  # names that are not UTF-8 stay as they are
     while line := sys.stdin.readline() if sys.stdin is not None else "":  # None where the parent process has closed it
         if text := line.rstrip("\r\n"):
             yield Path(text)

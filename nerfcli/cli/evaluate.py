@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nerfcli.cli.batch import STDIN, Given, for_each_input
+from nerfcli.cli.batch import STDIN, Given, for_each_input, for_each_path
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Computing, Overwrite, Printing, Require, one_of
 from nerfcli.output import Output
@@ -87,9 +87,7 @@ def evaluate(
     if len(runs) == 1:
         for_each_input(runs[0], work, command="evaluate")
         return
-    measured = {folder: measure(folder) for folder in map(Path, runs)}
-    for folder, metrics in measured.items():
-        check_requirements(Run(folder), metrics, requirements)
+    for_each_path(map(Path, runs), work, command="evaluate")
 
 
 def requirements_of(text: str | None) -> "tuple[Requirement, ...]":

@@ -1,7 +1,8 @@
 """nerfcli export: export a run as a page, a mesh, points or splats."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -143,6 +144,8 @@ def export(
 
     def work(given: Given) -> None:
         target = writing.named(given, default_target(given.path, to, suffix))
+        if suffix is not None and target.path is not None and not Path(target.path).suffix:
+            target = replace(target, path=Path(target.path).with_suffix(suffix))
         with console.stage(f"export {to}") as reporter:
             written = export_run(
                 given.path,

@@ -110,9 +110,7 @@ class Writing:
     def beside(self, given: Given, suffix: str) -> Destination:
         """Return where the result of an input goes: by default beside it, with a suffix added to its name."""
         path = Destination(self.output if not given.one_of_many else None).beside(given.path, suffix)
-        if self.output is not None and given.one_of_many:
-            path = self.output / path.name
-        return Destination(path, self.overwrite)
+        return self._one_of_many(given, path)
 
     def inside(self, given: Given, suffix: str) -> Destination:
         """Return the folder for the results of an input, one of its own for each of several; by default none."""
@@ -120,7 +118,16 @@ class Writing:
 
     def named(self, given: Given, usual: Path) -> Destination:
         """Return where the result of an input goes: by default to `usual`, of several to a path of that name."""
-        path = usual if self.output is None else self.output / usual.name if given.one_of_many else self.output
+        return self._one_of_many(given, usual if self.output is None or given.one_of_many else self.output)
+
+    def _one_of_many(self, given: Given, path: Path) -> Destination:
+        """Return where a result goes: of several inputs into the folder of results, if there is one."""
+        if given.one_of_many and self.output is not None:
+            # Folders that `nerfcli run -o` makes have the same name for every capture.
+            before = f"{given.path.resolve().parent.name}-" if given.path.name in ("scene", "run") else ""
+            path = self.output / f"{before}{path.name}"
+        if given.one_of_many:
+            given.refuse_taken(path)
         return Destination(path, self.overwrite)
 
 

@@ -321,11 +321,14 @@ def render(
 
     views, usual, console = seen.views(), files.settings(depths, seen.cameras), printing.console
     _refuse_unused(seen, depths, files, usual.outputs)
+    if splats is not None:
+        _refuse_of_runs(splats, {"--step": files.step != 1.0, "--check-accuracy": files.check_accuracy})
 
     def work(given: Given) -> None:
         path, how = given.path, {"views": views, "settings": usual, "resources": computing.resources}
         if path.suffix.lower() in SUFFIXES:
-            _refuse_of_runs(path, {"--cameras-only": seen.cameras_only, "--splats": splats is not None})
+            of_fields = {"--step": files.step != 1.0, "--check-accuracy": files.check_accuracy}
+            _refuse_of_runs(path, {"--cameras-only": seen.cameras_only, "--splats": splats is not None, **of_fields})
             with console.stage(f"render {views.name}") as reporter:
                 output = writing.inside(replace(given, path=path.with_suffix("")), "")
                 written = render_splats(path, output, **how, reporter=reporter)
@@ -355,11 +358,13 @@ def _refuse_unused(seen: ViewOptions, depths: DepthOptions, files: FileOptions, 
     """Refuse options that nothing would use, and alpha in videos."""
     from nerfcli.workflows.views import PATHS, Views
 
-    writes_fps = files.writes_video or seen.cameras_only
+    writes_fps, no_depth = files.writes_video or seen.cameras_only, set(outputs) <= {"rgb", "opacity"}
     is_background = depths.depth == "background"
     unused = {
         "--fps": (files.fps is not None and not writes_fps, "--video"),
-        "--depth": (depths.depth != "conditional" and set(outputs) <= {"rgb", "opacity"}, "--outputs depth"),
+        "--depth": (depths.depth != "conditional" and no_depth, "--outputs depth"),
+        "--depth-axis": (depths.depth_axis is not None and no_depth, "--outputs depth"),
+        "--min-opacity": (depths.min_opacity != 0.5 and no_depth, "--outputs depth"),
         "--background-distance": (depths.background_distance is not None and not is_background, "--depth background"),
         "--rgba": (files.rgba and "rgb" not in outputs, "--outputs rgb"),
         "--count": (seen.count != Views.count and seen.cameras not in PATHS, f"--cameras {', '.join(PATHS)}"),

@@ -362,8 +362,9 @@ def list_photos(folder: Path, *, subfolders: bool = False) -> Listing:
         shown = (path for path in others if path.is_file() and not path.name.startswith("."))
         counts.update(path.suffix.lower() or "without a suffix" for path in shown)
     skipped = ", ".join(f"{count} {suffix}" for suffix, count in counts.most_common())
-    found = (sorted(paths, key=lambda path: name_in(folder, path)) for paths in (pictures, unreadable))
-    return Listing(*found, skipped)
+    for paths in (pictures, unreadable):
+        paths.sort(key=lambda path: name_in(folder, path))
+    return Listing(pictures, unreadable, skipped)
 
 
 def name_in(folder: Path, path: Path) -> str:

@@ -258,21 +258,16 @@ def read_frames(video: Video, numbers: Sequence[int]) -> Iterator[np.ndarray]:
         UserError: a frame is missing, as the video has changed since it was measured.
     """
     for first in range(0, len(numbers), _MOST_NUMBERS):
-        yield from _read_some(video, numbers[first : first + _MOST_NUMBERS])
-
-
-def _read_some(video: Video, numbers: Sequence[int]) -> Iterator[np.ndarray]:
-    """Yield the frames of `read_frames`, at most `_MOST_NUMBERS`."""
-    given = 0
-    # The fields of a frame are interpolated with those of its neighbours, so before the choice.
-    filters = f"{video._whole_frames}select='{_one_of(numbers)}',{_SRGB_FROM_HDR if video.hdr else ''}{_UPRIGHT}"
-    with _decoding(video.path, filters, "ppm", stream=f"0:{video.stream}") as decoder:
-        for frame in decoder.frames():
-            given += 1
-            yield frame
-        decoder.finish()
-    if given != len(numbers):
-        raise _unreadable(video.path, decoder)
+        some, given = numbers[first : first + _MOST_NUMBERS], 0
+        # The fields of a frame are interpolated with those of its neighbours, so before the choice.
+        filters = f"{video._whole_frames}select='{_one_of(some)}',{_SRGB_FROM_HDR if video.hdr else ''}{_UPRIGHT}"
+        with _decoding(video.path, filters, "ppm", stream=f"0:{video.stream}") as decoder:
+            for frame in decoder.frames():
+                given += 1
+                yield frame
+            decoder.finish()
+        if given != len(some):
+            raise _unreadable(video.path, decoder)
 
 
 class _Decoder:

@@ -251,7 +251,7 @@ def _comment(job: RenderJob, meta: DepthMeta, output: str, ranges: dict[str, Col
     """Return the description of a video for its container's comment."""
     description: dict[str, Any] = {"nerfcli": __version__, "outputs": [output], **job.provenance}
     if output in MEASURED:
-        description |= meta.to_json()
+        description |= meaning_of(meta, job.settings.depth, output).to_json()
         description |= {"ranges": {output: asdict(ranges[output])}, "colour_map": COLOURS}
     return description
 

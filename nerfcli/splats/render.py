@@ -192,6 +192,8 @@ class SplatScene:
         Raises:
             UserError: the picture is a whole sphere.
         """
+        if depth is not None and depth.convention == "background" and depth.background_distance is None:
+            raise ValueError("the background convention needs a background distance")
         behind = self.background if background is None or isinstance(background, SphereBackground) else background
         view = splat_view(frame, splats_from_scene=Similarity.identity(), near=self.near)
         seen = render_splats(self.rows, view, np.asarray(behind))

@@ -79,7 +79,7 @@ def evaluate_run(
     model = trained.model(torch_device)
     checkpoint = model.sha256
     assert checkpoint is not None
-    if (kept := _kept(path, checkpoint, output, reporter, predictions=predictions)) is not None:
+    if (kept := _kept(path, checkpoint, output, reporter, predictions=predictions, run=trained.path)) is not None:
         return kept
 
     summary = trained.summary
@@ -134,7 +134,7 @@ def evaluate_splats(
     trained.check_split()
     scene, digest = load_splats(file, notify=reporter.note), file_digest(file)
     path = output.at(trained.path / f"metrics-{file.name}.json")
-    if (kept := _kept(path, digest, output, reporter)) is not None:
+    if (kept := _kept(path, digest, output, reporter, run=trained.path)) is not None:
         return kept
     refuse_read_only(path)
     held_out = held_out_photos(trained, trained.cameras.test)
@@ -196,7 +196,7 @@ def saved_predictions(
 
 
 def _kept(
-    path: Path, checkpoint: str, output: Output, reporter: Reporter, *, predictions: str | None = None
+    path: Path, checkpoint: str, output: Output, reporter: Reporter, *, run: Path, predictions: str | None = None
 ) -> Evaluation | None:
     """Return existing metrics that stay; raise if they are of another checkpoint or lack the predictions."""
     if output.overwrite or not path.exists():
@@ -205,9 +205,7 @@ def _kept(
     metrics = RunMetrics.from_json(content, path)
     if metrics.checkpoint_sha256 != checkpoint:
         raise UserError(f"{path} belongs to an earlier checkpoint or file", "add --overwrite to replace it")
-    if predictions is not None and not predictions_are_there(
-        path.with_name(PREDICTIONS), predictions, checkpoint=checkpoint
-    ):
+    if predictions is not None and not predictions_are_there(run / PREDICTIONS, predictions, checkpoint=checkpoint):
         raise UserError(f"{path} was written without saved predictions", "add --overwrite to evaluate again")
     made_by = metrics.protocol.split(":")[0]
     older = "" if made_by == PROTOCOL else f" (by {made_by})"

@@ -5,6 +5,7 @@ seconds.
 """
 
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from nerfcli.render.depth_errors import STRATA, DepthErrors
 from nerfcli.render.model import Model
 from nerfcli.training.runs.files import DEPTH_ERRORS, PHOTO_DEPTHS
 from nerfcli.training.runs.run import Run
+from nerfcli.workflows.splats import file_digest
 
 FORMAT, ERRORS_FORMAT = "nerfcli photo depths 1", "nerfcli depth errors 1"
 # Fraction of held-out pixels that must be matched for reliable intervals. Measured: with 60 % matched, 89 % of the
@@ -100,9 +102,16 @@ def _without_masked(view: DepthMap, frame: Frame, notify: Notify) -> DepthMap:
 
 
 def _digest(field_sha256: str | None, frames: Sequence[Frame]) -> str:
-    """Return the hash of everything that the maps depend on: the field, the cameras of the photos, the size."""
+    """Return the hash of everything that the maps depend on: the field, the cameras and masks of the photos, the size.
+
+    A mask that is not there, or whose photo is not, counts as none: once it is back, the maps are made again.
+    """
     cameras = [[frame.name, frame.camera.to_json(), frame.world_from_cam.tolist()] for frame in frames]
-    return digest([FORMAT, field_sha256, cameras, MAX_SIZE, STEEPEST_DEG])
+    there = [
+        frame.mask if frame.mask is not None and frame.mask.is_file() and frame.has_photo else None for frame in frames
+    ]
+    masks = [mask and file_digest(mask) for mask in there]
+    return digest([FORMAT, field_sha256, cameras, masks, MAX_SIZE, STEEPEST_DEG])
 
 
 def _read_photo_depths(run: Path, frames: Sequence[Frame], *, expected: str) -> tuple[DepthMap, ...] | None:
@@ -113,7 +122,7 @@ def _read_photo_depths(run: Path, frames: Sequence[Frame], *, expected: str) -> 
             if str(archive["digest"]) != expected:
                 return None
             return tuple(DepthMap(small_frame(frame, MAX_SIZE), archive[str(i)]) for i, frame in enumerate(frames))
-    except (OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile):
+    except (OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile, zlib.error):
         return None
 
 

@@ -1,24 +1,29 @@
 """All stages in one call: poses, training, evaluation, splats, pictures, report."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from nerfcli.atomic import read_json
 from nerfcli.captures.archives import unpacked
 from nerfcli.captures.formats.registry import recognised
+from nerfcli.captures.holdout import DEFAULT_HOLDOUT
+from nerfcli.errors import UserError
 from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
 from nerfcli.output import Output, beside
 from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.render.files.file_facts import RENDERS as DESCRIPTION
 from nerfcli.render.job import OUTPUTS, ExportSettings, VideoSettings
 from nerfcli.training.runs.run import Run
 from nerfcli.training.runs.settings import TrainSettings, sizes_for
 from nerfcli.workflows.evaluate import Evaluation, evaluate_run, evaluate_splats
 from nerfcli.workflows.export import default_target, export_run
 from nerfcli.workflows.poses import estimate_poses, without_suffix
-from nerfcli.workflows.render import render_run
+from nerfcli.workflows.render import RENDERS, folder_name, render_run
 from nerfcli.workflows.report import report_runs
-from nerfcli.workflows.splats import SplatSettings
+from nerfcli.workflows.splats import SplatSettings, are_of, file_digest
 from nerfcli.workflows.train import train_scene
 from nerfcli.workflows.views import Views, usual_depth
 
@@ -31,16 +36,16 @@ class PipelineResult:
         scene: the folder with poses, or the capture that was given.
         run: the trained field.
         evaluation, evaluation_of_splats: metrics on the held-out photos.
-        splats: a .ply.
-        renders: folders of the held-out views, and videos of an orbit around the splats.
+        splats: a .ply; None for 360-degree photos, for which there are no splats.
+        renders: folders of the held-out views, and videos of an orbit around the splats, or else the field.
         report: a page about all this.
     """
 
     scene: Path
     run: Run
     evaluation: Evaluation
-    splats: Path
-    evaluation_of_splats: Evaluation
+    splats: Path | None
+    evaluation_of_splats: Evaluation | None
     renders: list[Path]
     report: Path
 
@@ -82,6 +87,8 @@ def run_pipeline(
     settings = replace(settings, threads=resources.cores, device=resources.torch_device)
     scene_output = Output(None if output.path is None else Path(output.path) / "scene", again)
     capture = _capture_of(Path(photos), scene_output, reporter)
+    if capture is not None:
+        _refuse_unused(Path(photos), poses, frames=frames, intrinsics=intrinsics)
     scene = capture or estimate_poses(
         photos,
         scene_output,
@@ -94,29 +101,59 @@ def run_pipeline(
     named = without_suffix(Path(photos) if capture else scene)
     run_path = beside(named, "-run") if output.path is None else Path(output.path) / "run"
     with reporter.stage(f"train {scene.name}") as stage:
-        run = train_scene(scene, Output(run_path, again), settings, resume=None, resources=resources, reporter=stage)
-    usual = Output(overwrite=again)
+        run = train_scene(
+            scene,
+            Output(run_path, again),
+            settings,
+            resume=None,
+            holdout=poses.holdout if capture is not None and poses.holdout != DEFAULT_HOLDOUT else None,
+            resources=resources,
+            reporter=stage,
+        )
+    usual, field = Output(overwrite=again), run.checkpoint_sha256()
+
+    def replacing(file: Path, key: str, made_from: str | None) -> Output:
+        """Return the output of a result that is described in a file: one of an earlier field is replaced."""
+        made = None
+        if file.is_file():
+            with suppress(UserError):
+                made = read_json(file, needed=(key,), hint="")[key]
+        return Output(overwrite=again or made not in (None, made_from))
+
     with reporter.stage("evaluate") as stage:
-        evaluation = evaluate_run(run.path, usual, resources=resources, reporter=stage)
+        output_of_metrics = replacing(run.metrics_path, "checkpoint_sha256", field)
+        evaluation = evaluate_run(run.path, output_of_metrics, resources=resources, reporter=stage)
     for result in (run.path, evaluation) if capture else (scene, run.path, evaluation):
         show(result)
 
-    splats = default_target(run.path, "splats")
-    if again or not splats.exists():
-        half = SplatSettings(budget_seconds=(settings.budget_seconds or 2 * SplatSettings.budget_seconds) / 2)
-        with reporter.stage("export splats") as stage:
-            export_run(run.path, usual, to="splats", splats=half, resources=resources, reporter=stage)
-    with reporter.stage("evaluate splats") as stage:
-        of_splats = evaluate_splats(run.path, splats, usual, resources=resources, reporter=stage)
-    for result in (of_splats, splats):
-        show(result)
+    splats = of_splats = None
+    if any(frame.camera.is_spherical for frame in run.cameras.train):
+        reporter.note("360-degree photos have no splats; the video is made from the field")
+    else:
+        splats = default_target(run.path, "splats")
+        is_old = splats.exists() and not are_of(splats, run)
+        if again or is_old or not splats.exists():
+            seconds = (settings.budget_seconds or 2 * SplatSettings.budget_seconds) / 2
+            half = SplatSettings(budget_seconds=seconds, resume=None)
+            with reporter.stage("export splats") as stage:
+                replaced = Output(overwrite=again or is_old)
+                export_run(run.path, replaced, to="splats", splats=half, resources=resources, reporter=stage)
+        with reporter.stage("evaluate splats") as stage:
+            file = run.path / f"metrics-{splats.name}.json"
+            replaced = replacing(file, "checkpoint_sha256", file_digest(splats))
+            of_splats = evaluate_splats(run.path, splats, replaced, resources=resources, reporter=stage)
+        for result in (of_splats, splats):
+            show(result)
 
     renders = []
     for views, outputs, shown in ((Views("test"), OUTPUTS[:3], None), (Views("orbit"), OUTPUTS[:2], splats)):
-        wanted = ExportSettings(outputs, usual_depth(run, views), video=VideoSettings() if shown else None)
+        video = VideoSettings() if views.cameras == "orbit" else None
+        wanted = ExportSettings(outputs, usual_depth(run, views), video=video)
+        folder = run.path / RENDERS / folder_name(views, wanted, of_splats=shown is not None)
+        replaced = replacing(folder / DESCRIPTION, "field_sha256", field)
         with reporter.stage(f"render {views.name}") as stage:
             written = render_run(
-                run.path, usual, views=views, settings=wanted, splats=shown, resources=resources, reporter=stage
+                run.path, replaced, views=views, settings=wanted, splats=shown, resources=resources, reporter=stage
             )
         for path in written:
             show(path)
@@ -125,6 +162,17 @@ def run_pipeline(
         report = report_runs([run.path], usual, keep=True, resources=resources, reporter=stage)
     show(report)
     return PipelineResult(scene, run, evaluation, splats, of_splats, renders, report)
+
+
+def _refuse_unused(photos: Path, poses: PoseSettings, *, frames: int | None, intrinsics: Path | None) -> None:
+    """Refuse settings of poses for a capture that has poses."""
+    usual = PoseSettings(seed=poses.seed, threads=poses.threads, holdout=poses.holdout)
+    if frames is not None or intrinsics is not None or poses != usual:
+        raise UserError(
+            f"{photos} has poses, which are used: --frames, --intrinsics, --quality and --subfolders do nothing",
+            "remove them; for new poses, give the folder of its photos",
+            exit_code=2,
+        )
 
 
 def _usual_training(resources: Resources) -> TrainSettings:

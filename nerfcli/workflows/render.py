@@ -34,11 +34,10 @@ RENDERS = "renders"
 HELD_OUT = Views("test")
 
 
-def folder_name(views: Views, settings: ExportSettings) -> str:
+def folder_name(views: Views, settings: ExportSettings, *, of_splats: bool = False) -> str:
     """Return the name of the folder in RUN/renders: the views and, so that conventions never mix, the kind of depth."""
-    if not settings.measured:
-        return views.name
-    return f"{views.name}-{settings.depth.convention.replace(':', '-')}-{settings.depth.axis}"
+    depth = f"-{settings.depth.convention.replace(':', '-')}-{settings.depth.axis}" if settings.measured else ""
+    return f"{views.name}{depth}{'-splats' if of_splats else ''}"
 
 
 def usual_settings(run: Run, views: Views) -> ExportSettings:
@@ -80,13 +79,16 @@ def render_run(
     """
     trained, torch_device = load_run(run), resources.torch_device
     settings = usual_settings(trained, views) if settings is None else settings
-    name = folder_name(views, settings) + ("-splats" if splats is not None else "")
-    folder = output.at(trained.path / RENDERS / name)
+    folder = output.at(trained.path / RENDERS / folder_name(views, settings, of_splats=splats is not None))
     resources.begin()
     model = trained.model(torch_device)
     shown: Model | SplatScene = model.stretched(settings.step)
     seen = ()
-    provenance: dict[str, Any] = {"cameras": views.cameras, "run": trained.path.name, "field_sha256": model.sha256}
+    provenance: dict[str, Any] = {
+        "cameras": views.cameras,
+        "run": trained.path.resolve().name,
+        "field_sha256": model.sha256,
+    }
     if splats is not None:
         shown, of_file = load_splats(splats, notify=reporter.note), file_digest(Path(splats))
         provenance |= {"splats": Path(splats).name, "splats_sha256": of_file}
@@ -102,7 +104,7 @@ def render_run(
         settings = replace(settings, depth=replace(settings.depth, background_distance=farthest))
     # The unit of the training frame is about the distance between the cameras and what they look at.
     frames = chosen_frames(trained, views, depth_hint=1.0 / model.training_from_scene.scale)
-    if "depth" in settings.outputs and settings.depth.axis == "z":
+    if splats is None and "depth" in settings.outputs and settings.depth.axis == "z":
         refuse_z_depth_for_equirectangular(frames, notify=reporter.note)
     job = RenderJob(tuple(frames), settings, provenance, seen, errors)
     return render_job(shown, job, replace(output, path=folder), part=views.part, reporter=reporter)
@@ -141,11 +143,15 @@ def render_splats(
             "leave them out, or render the run: nerfcli render RUN --splats FILE",
             exit_code=2,
         )
+    if settings.depth.convention == "background" and settings.depth.background_distance is None:
+        raise UserError(
+            "--depth background of a file of splats needs a distance for light that hits nothing",
+            "add --background-distance",
+            exit_code=2,
+        )
     resources.begin()
     splats = load_splats(path, notify=reporter.note)
     frames = frames_of_file(views)
-    if "depth" in settings.outputs and settings.depth.axis == "z":
-        refuse_z_depth_for_equirectangular(frames, notify=reporter.note)
     provenance = {"cameras": views.cameras, "splats": path.name, "splats_sha256": file_digest(path)}
     folder = output.at(path.with_name(f"{path.stem}-{RENDERS}") / folder_name(views, settings))
     job = RenderJob(tuple(frames), settings, provenance)
@@ -165,6 +171,7 @@ def write_cameras(
     trained = Run(Path(run))
     folder = output.at(trained.path / RENDERS / f"{views.name}-cameras")
     frames = chosen_frames(trained, views, depth_hint=1.0 / trained.model().training_from_scene.scale)
+    frames = frames[views.part or slice(None)]
     alone = tuple(replace(frame, image=None, mask=None, split=None) for frame in frames)
     capture = Capture(alone, np.zeros((0, 3)), (), None, "camera-path")
     listed, path = folder / "cameras.json", folder / "camera_path.json"

@@ -54,14 +54,14 @@ class SplatSettings:
         budget_seconds: of refinement, wall time.
         degree: of the harmonics of colours, 0 to 3.
         frame: "viewer", whose y points down, or "scene".
-        resume: refine the splats that the run has further, to `budget_seconds` in total.
+        resume: refine the splats that the run has further, to `budget_seconds` in total; None if it has such splats.
     """
 
     count: int | None = None
     budget_seconds: float = 60.0
     degree: int = 2
     frame: str = "viewer"
-    resume: bool = False
+    resume: bool | None = False
 
 
 def export_splats(
@@ -183,7 +183,8 @@ def run_splats(run: Run, model: Model, *, settings: SplatSettings, reporter: Rep
         )
         save_splats(run.path / SPLATS, splats)
         if interrupts.came is not None:
-            reporter.note("the splats are saved; the same command with --resume goes on")
+            again = "goes on" if settings.resume is None else "with --resume goes on"
+            reporter.note(f"the splats are saved; the same command {again}")
         interrupts.raise_if_pending()
     reporter.note(compared_in_words(model, loaded, splats))
     return splats
@@ -210,7 +211,8 @@ def _kept(run: Run, model: Model, settings: SplatSettings) -> RunSplats | None:
         )
     if not same or splats is None:
         return None
-    return splats if settings.resume or splats.refinement.seconds >= settings.budget_seconds else None
+    is_enough = splats.refinement.seconds >= settings.budget_seconds
+    return splats if is_enough or settings.resume is not False else None
 
 
 def _started(
@@ -294,6 +296,18 @@ def load_splats(path: str | Path, *, notify: Notify = silent) -> SplatScene:
     red, green, blue = (float(value) for value in description["background"])
     unit, source = str(description["unit"]), description["unit_source"]
     return SplatScene(gaussians.moved(scene_from_file), (red, green, blue), unit, source)
+
+
+def are_of(file: Path, run: Run) -> bool:
+    """Return whether a file of splats was exported after the splats of a run were made, from the field that it has now.
+
+    Without the run's own splats nothing is known of the file, and it counts as one.
+    """
+    state = run.path / SPLATS
+    if not state.is_file():
+        return True
+    is_newer = file.stat().st_mtime_ns >= state.stat().st_mtime_ns
+    return is_newer and load_splat_state(state).field_sha256 == run.checkpoint_sha256()
 
 
 def file_digest(path: Path) -> str:

@@ -63,7 +63,7 @@ def train_scene(
         output: the folder to write, SCENE-run by default.
         settings: budget, components, resolution, seed, device, threads.
         resume: continue from the last checkpoint of the run; start from the beginning if there is none. None to do so
-            only if a training of this scene with these settings was interrupted.
+            only if there is a training of this scene with these settings, whose budget may be smaller.
         holdout: photos to hold out, "every:8", "block:0.15" or a file of names; None for the scene's own split.
         resources: limit of memory; device and threads are those of the settings.
         reporter: its progress is the fraction of the budget, after every step.
@@ -77,25 +77,26 @@ def train_scene(
     """
     given = Path(scene)
     run = output.beside(given, "-run")
-    folder = unpacked(given, Output(run, output.overwrite), reporter=reporter)
+    if is_one_of_several():
+        distributed.join(settings.device)
+    folder = distributed.from_first(lambda: unpacked(given, Output(run, output.overwrite), reporter=reporter))
     loaded = load_scene(folder, holdout=holdout)
     _describe(folder, loaded, reporter)
+    again = "add --resume to" if resume is not None else "run"
     if resume is None:
-        resume = not output.overwrite and _was_interrupted(Run(run), loaded, settings)
+        resume = not output.overwrite and _goes_on(Run(run), loaded, settings)
     if resume and not Run(run).is_trained and not (run / STATE).exists():
         # A script that a scheduler starts again always gives --resume, and may have been ended before a checkpoint.
         resume = False
         _refuse_others(run)
         reporter.note(f"{run} has no checkpoint to resume; the training starts from the beginning")
     task = _Task(loaded, run, settings, resources.memory_limit(settings.device), resume, output.overwrite)
-    if is_one_of_several():
-        distributed.join(settings.device)
     if distributed.rank() > 0:
         _help(task)
     elif not _is_kept(task, reporter):
         with _claimed(run):
             if not _is_kept(task, reporter):  # another process may just have completed it
-                _train(task, reporter)
+                _train(task, reporter, again)
     return Run(run)
 
 
@@ -149,7 +150,8 @@ def _claimed(run: Path) -> Iterator[None]:
                         run.rmdir()
 
 
-def _train(task: _Task, reporter: Reporter) -> None:
+def _train(task: _Task, reporter: Reporter, again: str) -> None:
+    """Train, and say how to continue after an interrupt: `again` the same command."""
     run, budget = task.run, task.settings.budget_seconds
 
     def on_progress(state: loop.Progress) -> None:
@@ -166,13 +168,21 @@ def _train(task: _Task, reporter: Reporter) -> None:
         task.fit(run, notify=reporter.note, on_progress=on_progress)
     except KeyboardInterrupt:
         if (run / STATE).exists():
-            reporter.note(f"checkpoint saved in {run}; to continue, add --resume to the same command")
+            reporter.note(f"checkpoint saved in {run}; to continue, {again} the same command")
         raise
 
 
-def _was_interrupted(run: Run, scene: Capture, settings: TrainSettings) -> bool:
-    """Return whether a training of this scene with these settings was interrupted and left a checkpoint."""
-    return run.is_trained and run.is_trained_from(scene, settings) and not run.is_complete(settings)
+def _goes_on(run: Run, scene: Capture, settings: TrainSettings) -> bool:
+    """Return whether a training of this scene with these settings but for its budget is there to go on with."""
+    if not run.is_trained or (run.is_complete(settings) and run.is_trained_from(scene, settings)):
+        return False
+    return run.is_trained_from(scene, _with_limits_of(settings, run))
+
+
+def _with_limits_of(settings: TrainSettings, run: Run) -> TrainSettings:
+    """Return the settings with the budget and the steps of a run."""
+    before = run.config.settings
+    return replace(settings, budget_seconds=before.budget_seconds, steps=before.steps)
 
 
 def _describe(folder: Path, scene: Capture, reporter: Reporter) -> None:
@@ -207,9 +217,7 @@ def _keeps(task: _Task) -> bool:
     if task.resume and run.config.scene_fingerprint != fingerprint(scene):
         raise UserError(f"{path} was trained on a different scene than {scene.root}", "choose another folder with -o")
     if task.resume and run.is_complete(settings):  # decided before stereo matching is repeated needlessly
-        before = run.config.settings
-        same = replace(settings, budget_seconds=before.budget_seconds, steps=before.steps)
-        return run.is_trained_from(scene, same)
+        return run.is_trained_from(scene, _with_limits_of(settings, run))
     if run.is_trained and not task.resume and not task.overwrite:
         if run.is_trained_from(scene, settings) and run.is_complete(settings):
             return True

@@ -76,7 +76,7 @@ def last_logged(
 
 def _size(run: RunFacts) -> str:
     cameras = {(frame.camera.width, frame.camera.height) for frame in (*run.frames.train, *run.frames.test)}
-    return listed([f"{width} x {height}" for width, height in sorted(cameras)], most=4)
+    return listed([f"{width} x {height}" for width, height in sorted(cameras)])
 
 
 def _unit(run: RunFacts) -> str:
