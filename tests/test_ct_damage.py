@@ -265,6 +265,11 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], tuple[str, ...], str]] = {
     "photons of line integrals": (lambda f: heltomo(f).path, ("--photons", "1e4"), "does not apply to line integrals"),
     "no photons": (lambda f: stack(f).path, ("--photons", "-5"), "--photons -5"),
     "unit that is none": (lambda f: stack(f).path, ("--unit", "parsec"), "--unit parsec is not a unit"),
+    "a unit and no size": (
+        lambda f: rewritten(nxtomo(f).path, "entry/instrument/detector/x_pixel_size", None),
+        ("--unit", "um"),
+        "states no pixel size, to which --unit um would apply",
+    ),
     "axis far outside": (lambda f: stack(f).path, ("--centre-of-rotation", "900"), "far outside the 10 columns"),
 }
 
@@ -281,6 +286,33 @@ def test_damage_is_reported_in_two_lines_and_nothing_is_written(name: str, tmp_p
     assert re.search(expected, error), error
     assert len(hint) > 10
     assert not (tmp_path / "out").exists()
+
+
+def test_names_of_projections_are_no_patterns(tmp_path: Path) -> None:
+    path = edited(nikon(tmp_path).path, "Name=bone", "Name=/data/bone")
+    assert len(read_scan(path).values) == VIEWS
+    edited(path, "Name=/data/bone", "Name=bone[1]")
+    for picture in tmp_path.glob("*.tif"):
+        picture.rename(picture.with_name(picture.name.replace("bone", "bone[1]")))
+    tifffile.imwrite(tmp_path / "preview.tif", np.zeros((3, 5), np.uint16))
+    assert len(read_scan(path).values) == VIEWS
+
+
+@pytest.mark.parametrize("command", ["convert", "doctor", "train", "info", "evaluate", "render", "export"])
+def test_a_batch_goes_on_after_names_and_folders_that_cannot_be_read(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(folder: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(folder))
+
+    monkeypatch.setattr(Path, "iterdir", refused)
+    target = (tmp_path / "out",) if command == "convert" else ()
+    result = nerfcli("ct", command, "-", *target, stdin=f"{'x' * 300}\n{tmp_path}\nmissing\n")
+    assert result.exit_code == BAD_INPUT
+    errors = [line for line in result.stderr.splitlines() if line.startswith("Error:")]
+    assert errors[0] == f"Error: {'x' * 300} does not exist"
+    assert re.search("cannot be read: Permission denied|is not a reconstruction", errors[1])
+    assert errors[2] == "Error: missing does not exist"
 
 
 def test_rows_of_nan_are_left_out(tmp_path: Path) -> None:

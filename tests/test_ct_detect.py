@@ -62,7 +62,7 @@ def test_the_command_ranks_and_the_options_mend(tmp_path: Path) -> None:
     assert record["options"].startswith("--mirrored")
     text = nerfcli("ct", "convert", tmp_path / "scan", "--detect").stdout
     assert "mirrored or reversed; as stated is worse" in text
-    assert "To read it so: nerfcli ct convert IN SCAN --mirrored" in text
+    assert "To read it this way: nerfcli ct convert IN SCAN --mirrored" in text
 
 
 def test_few_views_are_refused() -> None:

@@ -125,6 +125,17 @@ def test_a_scan_is_not_replaced_unless_one_says_so(tmp_path: Path) -> None:
     assert (foreign / "diary.txt").exists()
 
 
+def test_scans_of_a_batch_get_names_of_their_own(tmp_path: Path) -> None:
+    """Formats fix some names of files; these scans are named after their folders, and others after their files."""
+    paths = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        paths.append(WRITERS["r2-gaussian"](tmp_path / name).path / "meta_data.json")
+    paths.append(nikon(tmp_path).path)
+    result = nerfcli("ct", "convert", "-", tmp_path / "out", stdin="".join(f"{path}\n" for path in paths))
+    assert result.stdout.splitlines() == [str(tmp_path / "out" / name) for name in ("a", "b", "bone")]
+
+
 def test_info_says_what_a_scan_is(tmp_path: Path) -> None:
     written = stack(tmp_path)
     nerfcli("ct", "convert", written.path, tmp_path / "o")

@@ -1,5 +1,6 @@
 """nerfcli convert: convert cameras between formats; detect conventions."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -31,7 +32,10 @@ FORMATS_WRITTEN = (
 # Names of programs that are accepted for the format that they read.
 PROGRAMS = {"nerfstudio": "transforms", "instant-ngp": "transforms"}
 # Names of files that do not identify the capture.
-COMMON_STEMS = ("transforms", "reconstruction", "bundle", "poses_bounds", "scene", "cameras", "images")
+COMMON_STEMS = (
+    *("transforms", "transforms_train", "transforms_test", "reconstruction", "bundle", "poses_bounds", "scene"),
+    *("cameras", "images", "meta_data", "scan"),
+)
 PIXEL_CENTRES = {"0.5": 0.5, "0": 0.0}
 # Number of best hypotheses per question in the table of --detect.
 _MOST_HYPOTHESES = 3
@@ -244,7 +248,7 @@ def convert(
     def work(given: Given) -> None:
         done, record = convert_capture(
             given.path,
-            target / _named_for(given.path).resolve().name if given.one_of_many else target,
+            target / named_for(given.path).resolve().name if given.one_of_many else target,
             wanted,
             given=read.given(),
             overrides=overrides,
@@ -310,8 +314,8 @@ def _pixel_centre(text: str | None, option: str) -> float | None:
     return None if text is None else PIXEL_CENTRES[one_of(text, PIXEL_CENTRES, option)]
 
 
-def _named_for(path: Path) -> Path:
+def named_for(path: Path) -> Path:
     """Return what a result is named after: a file without suffix, or its folder if its name tells nothing."""
-    if not path.is_file():
+    if not os.path.isfile(path):
         return path
     return path.parent if path.stem in COMMON_STEMS else path.with_suffix("")

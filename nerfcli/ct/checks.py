@@ -8,6 +8,7 @@ from skimage.filters import threshold_otsu
 from nerfcli.ct.centre import FEWEST_VIEWS, FINE, centre_of
 from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.geometry import ScanGeometry, circle_of
+from nerfcli.ct.open_beam import MEDIAN_DEVIATION
 from nerfcli.ct.quick import filled, highest_contrast_row, predicted, reconstructed
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import several
@@ -17,8 +18,8 @@ from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, finding, verdict_ab
 MOST_ROWS, MOST_VIEWS = 32, 400
 # Columns at each side that should see past the object, as a fraction of the width.
 BORDER = 0.02
-# Median of |x| of a normal distribution as a fraction of its standard deviation; variance of a second difference.
-_MAD, _SECOND = 0.6745, 6.0
+# Variance of a second difference of noise.
+_SECOND = 6.0
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ def sample_of(scan: Scan) -> Sample:
     second = np.abs(np.diff(integrals, 2, axis=2)) if integrals.shape[2] > 4 else np.zeros((1, 1, 1))
     inner = integrals[..., 1:-1] if integrals.shape[2] > 4 else integrals[..., :1]
     thin = inner <= np.quantile(inner, 0.25)
-    noise = float(np.median(second[thin])) / _MAD / np.sqrt(_SECOND) if thin.any() else 0.0
+    noise = float(np.median(second[thin])) / MEDIAN_DEVIATION / np.sqrt(_SECOND) if thin.any() else 0.0
     return Sample(scan, rows, integrals, noise, float(np.quantile(integrals, 0.995)))
 
 
@@ -112,7 +113,7 @@ def drift(sample: Sample) -> Finding | str:
         return "too few views"
     low, high = np.quantile(means, [0.02, 0.98])
     # The spread that noise alone causes in a mean over these pixels.
-    pixels = border.shape[1] * max(1, round(0.02 * sample.integrals.shape[2]))
+    pixels = border.shape[1] * max(1, round(BORDER * sample.integrals.shape[2]))
     by_noise = 4 * sample.noise / np.sqrt(pixels)
     number = float(np.sqrt(max((high - low) ** 2 - by_noise**2, 0)))
     verdict = verdict_above(number, look=DRIFT_LOOK, bad=DRIFT_BAD)

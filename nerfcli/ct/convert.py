@@ -1,5 +1,6 @@
 """Convert a scan in any format to a scan folder."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +38,10 @@ def convert_scan(
     target = output.at(source)
     if target.suffix.lower() in _FILE_SUFFIXES:
         raise UserError(f"{target}: a scan is written as a folder", f"give a folder, such as {target.stem}")
-    if target.exists() and not (output.overwrite and is_scan(target)):
+    if os.path.exists(target) and not (output.overwrite and is_scan(target)):
         what = "add --overwrite to replace it" if is_scan(target) else "choose another output path"
         raise UserError(f"{target} exists", what)
-    if target.exists() and target.resolve() == source.resolve():
+    if os.path.exists(target) and target.resolve() == source.resolve():
         raise UserError(f"{target} is the input itself", "choose another output path")
     scan = read_scan(source, given)
     reporter.note(f"{source}: {scan.history.get('format')}, {in_words(scan)}")

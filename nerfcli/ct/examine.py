@@ -86,9 +86,9 @@ def examine(source: Path, output: Output = Output(), *, reporter: Reporter = Rep
     Raises:
         UserError: the scan cannot be read, or the page's path holds something else.
     """
+    scan = read_scan(source)
     page = output.beside(source, "-doctor.html")
     pages.claim_page(output, page, pages.Mark("doctor", source), about="scan")
-    scan = read_scan(source)
     reporter.note(f"{source}: {in_words(scan)}")
     diagnosis = examine_scan(scan, progress=reporter.progress)
     pages.write_page(page_html(diagnosis, source), page)

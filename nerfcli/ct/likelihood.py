@@ -16,10 +16,8 @@ import torch
 from scipy.optimize import root_scalar
 from torch import Tensor
 
+from nerfcli.ct.open_beam import MEDIAN_DEVIATION
 from nerfcli.ct.scan import Scan
-
-# Median of |x| of a normal variable of variance 1.
-_MEDIAN_DEVIATION = 0.6745
 
 
 @dataclass(frozen=True)
@@ -194,7 +192,7 @@ def noise(values: np.ndarray) -> float:
     found = np.abs(fourth[np.isfinite(fourth)])
     deviation = float(np.median(found)) if len(found) else 0.0
     # The squares of 1, -4, 6, -4, 1 sum up to 70.
-    return deviation / _MEDIAN_DEVIATION / np.sqrt(70) or 1.0
+    return deviation / MEDIAN_DEVIATION / np.sqrt(70) or 1.0
 
 
 def _values(scan: Scan, views: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ OUTLIER = 5.0
 # A pixel below this fraction of the median open beam is dead.
 DEAD_BELOW = 0.05
 # Median of |x - median| of a normal distribution, as a fraction of its standard deviation.
-_MAD = 0.6745
+MEDIAN_DEVIATION = 0.6745
 # Least number of pixels for an estimate of the noise of flats.
 _ENOUGH = 200
 
@@ -101,7 +101,7 @@ def robust_mean(frames: np.ndarray) -> np.ndarray:
     centre = np.median(frames, axis=0)
     apart = np.abs(frames - centre)
     # Few frames give a poor estimate of a pixel's own deviation: the median over all pixels is its lower bound.
-    deviation = np.median(apart, axis=0) / _MAD
+    deviation = np.median(apart, axis=0) / MEDIAN_DEVIATION
     deviation = np.maximum(deviation, float(np.nanmedian(deviation)))
     kept = apart <= OUTLIER * deviation + 1e-12 * np.abs(centre)
     return np.where(kept, frames, 0).sum(0) / np.maximum(kept.sum(0), 1)

@@ -4,6 +4,7 @@ Only names and the beginnings of files are read, and nothing heavy is imported b
 ask this before they load anything.
 """
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ def is_volume(path: Path) -> bool:
     suffix = path.suffix.lower()
     if suffix in (".tif", ".tiff"):
         return _has(path, "ImageJ=", "\nspacing=", "\nfirst=")
-    return suffix in VOLUMES and path.is_file()
+    return suffix in VOLUMES and os.path.isfile(path)
 
 
 def recognise(path: Path) -> str | None:
@@ -49,8 +50,8 @@ def recognise(path: Path) -> str | None:
     Raises:
         UserError: it looks like a scan and cannot be read, or a folder holds several.
     """
-    if not path.is_dir():
-        return _of_file(path) if path.is_file() else None
+    if not os.path.isdir(path):  # names may be too long for Path.is_dir
+        return _of_file(path) if os.path.isfile(path) else None
     for name, (form, word) in _NAMED.items():
         if _has(path / name, word):
             return form
@@ -66,9 +67,17 @@ def recognise(path: Path) -> str | None:
 
 
 def files_of(folder: Path, form: str) -> list[Path]:
-    """Return the files of a folder that describe a scan in the format of a scanner; none for other formats."""
+    """Return the files of a folder that describe a scan in the format of a scanner; none for other formats.
+
+    Raises:
+        UserError: the folder cannot be read.
+    """
     suffix, word = _SUFFIXES.get(form, ("/", ""))
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() == suffix and _has(file, word))
+    try:
+        files = sorted(folder.iterdir())
+    except OSError as error:
+        raise UserError(f"{folder} cannot be read: {error.strerror}", "make the folder readable") from error
+    return [file for file in files if file.suffix.lower() == suffix and _has(file, word)]
 
 
 def open_hdf5(path: Path) -> Any:
@@ -127,7 +136,7 @@ def _hdf5_form(path: Path) -> str | None:
 
 def _has_transforms(folder: Path) -> bool:
     """Return whether the transforms of a folder describe transmissions; those of photos do not state a measurement."""
-    return (folder / TRANSFORMS_GEOMETRY).is_file() and _has(folder / TRANSFORMS[0], '"measurement"', MEASUREMENT)
+    return os.path.isfile(folder / TRANSFORMS_GEOMETRY) and _has(folder / TRANSFORMS[0], '"measurement"', MEASUREMENT)
 
 
 def _has(path: Path, *words: str) -> bool:
@@ -135,6 +144,6 @@ def _has(path: Path, *words: str) -> bool:
     try:
         with path.open("rb") as file:
             beginning = file.read(_BEGINNING_BYTES)
-    except OSError:
+    except (OSError, ValueError):  # a ValueError for a name with a null byte
         return False
     return all(word.encode() in beginning for word in words)

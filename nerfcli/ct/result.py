@@ -4,6 +4,7 @@ RUN/reconstruction.json records what was fitted, how, and the decisions taken; R
 RUN/marks.npy marks the voxels that the views do not determine, see `marks`.
 """
 
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -144,7 +145,7 @@ def load_reconstruction(run: Path) -> Reconstruction:
     """
     if not is_reconstruction(run):
         hint = "give a run folder that nerfcli ct train wrote"
-        raise UserError(f"{run} is not a reconstruction" if run.exists() else f"{run} does not exist", hint)
+        raise UserError(f"{run} is not a reconstruction" if os.path.exists(run) else f"{run} does not exist", hint)
     try:
         content = read_sealed(run / DESCRIPTION)
         arrays = {name: read_array(run / name, digest) for name, digest in content["arrays"].items()}

@@ -1,6 +1,7 @@
 """nerfcli ct convert, doctor, train, info: from a scanner's files to a volume."""
 
 import math
+import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,13 +11,14 @@ import typer
 from nerfcli.cli import options
 from nerfcli.cli.batch import Given, for_each_input
 from nerfcli.cli.console import Console, command
+from nerfcli.cli.convert import named_for
 from nerfcli.cli.doctor import GATES, Gate, check_gate, show_findings
 from nerfcli.cli.info import show_facts
 from nerfcli.cli.options import Json, Overwrite, Printing, Writing, holdout_rule, one_of
 from nerfcli.ct.recognise import OWN, recognise
 from nerfcli.errors import UserError, in_shell
 from nerfcli.machine import thread_count
-from nerfcli.output import Output
+from nerfcli.output import Output, beside
 
 if TYPE_CHECKING:
     from nerfcli.ct.detect import Judgement
@@ -33,7 +35,7 @@ class ScanStatements:
     ] = None
     unit: Annotated[
         str | None,
-        typer.Option(help="Unit of lengths in IN, m, mm, um or nm, before what IN says."),
+        typer.Option(help="Unit of lengths in IN, m, mm, um or nm; overrides what IN states."),
     ] = None
     mirrored: Annotated[
         bool, typer.Option("--mirrored", help="Columns are numbered from the other side than IN says.")
@@ -103,7 +105,7 @@ def convert(
         if target is None:
             _detect(path, statements, console)
             return
-        place = target / (path.stem if path.is_file() else path.name) if given.one_of_many else target
+        place = target / beside(named_for(path), "").name if given.one_of_many else target
         record = convert_scan(path, Output(place, overwrite), given=statements, reporter=console.reporter)
         console.result(place, record)
 
@@ -141,7 +143,7 @@ def _table(found: "Judgement") -> list[str]:
         )
     lines.append(f"  {found.ambiguity}")
     if found.options:
-        lines.append(f"  To read it so: nerfcli ct convert IN SCAN {found.options}")
+        lines.append(f"  To read it this way: nerfcli ct convert IN SCAN {found.options}")
     return lines
 
 
@@ -279,7 +281,7 @@ def train(
 def _refuse_other_formats(path: Path) -> None:
     form = recognise(path)
     if form is None:
-        what = "is not a scan folder" if path.exists() else "does not exist"
+        what = "is not a scan folder" if os.path.exists(path) else "does not exist"
         raise UserError(f"{path} {what}", "give a folder that nerfcli ct convert wrote")
     if form != OWN:
         line = f"nerfcli ct convert {in_shell(path)} SCAN"

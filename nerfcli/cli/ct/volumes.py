@@ -149,11 +149,9 @@ def export(
     writing: Writing,
     form: Annotated[
         str | None,
-        typer.Option("--format", help="nrrd, mha, nii or tif, if -o does not say it.  [default: nrrd]"),
+        typer.Option("--format", help="nrrd, mha, nii or tif, unless the suffix of -o determines it.  [default: nrrd]"),
     ] = None,
-    water: Annotated[
-        float | None, typer.Option(help="Attenuation of water, so that values are Hounsfield units.")
-    ] = None,
+    water: Annotated[float | None, typer.Option(help="Write Hounsfield units, given the attenuation of water.")] = None,
     printing: Printing,
 ) -> None:
     """Export the volume of a reconstruction.

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
+from nerfcli.ct.formats.assemble import ReaderOutput, scan_of
 from nerfcli.ct.formats.statement import ScanOptions, angles_in_radians, millimetres
 from nerfcli.ct.geometry import Circle
 from nerfcli.ct.open_beam import check_sizes, open_beam_of
@@ -97,9 +97,12 @@ def _parallel(
     notes = ["the file does not say which way the source moved: counter-clockwise around the object is assumed"]
     width, height, stated = (1.0, 1.0, 1.0) if sides is None else sides
     circle = Circle("parallel", tuple(angles.tolist()), width, height, data.shape[1], data.shape[2])
-    unit = "mm" if sides is not None else UNKNOWN_UNIT
-    if sides is None and given.unit is None:
-        unit = "voxel"
+    if sides is None:
+        if given.unit is not None:
+            raise UserError(
+                f"{path} states no pixel size, to which --unit {given.unit} would apply",
+                "store the size in the file as x_pixel_size, or leave out --unit: lengths are then in pixels",
+            )
         notes.append("the file does not state the pixel size: lengths are in pixels")
     beam = None
     if flats is None:
@@ -112,6 +115,7 @@ def _parallel(
     else:
         beam = open_beam_of(flats, darks)
     kind = "transmission" if beam is None else "counts"
+    unit = "voxel" if sides is None else "mm"
     return scan_of(ReaderOutput(path, form, data, kind, circle, unit, beam=beam, notes=notes, stated_mm=stated), given)
 
 

@@ -5,6 +5,7 @@ around it; columns run from right to left seen from the source. Angles come from
 *_ctdata.txt or .ang are used instead if they agree with it to half a step, or if there is no AngularStep.
 """
 
+import glob
 import re
 from pathlib import Path
 
@@ -112,7 +113,7 @@ def _projections(path: Path, fields: Statement, views: int) -> list[Path]:
     if name and (path.parent / name).is_dir():
         folder = path.parent / name
     stem = fields.text("Name", path.stem)
-    paths = numbered(folder, f"{stem}*") or numbered(folder)
+    paths = numbered(folder, f"{glob.escape(stem)}*") or numbered(folder)
     if len(paths) != views:
         raise UserError(
             f"{folder} holds {len(paths)} projections; {path.name} states {views}",

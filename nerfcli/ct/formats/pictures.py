@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from fnmatch import fnmatch
 from pathlib import Path
 from tokenize import TokenError
 
@@ -24,8 +25,10 @@ def numbered(folder: Path, pattern: str = "*", *, without: str | None = None) ->
     """
     paths = [
         path
-        for path in sorted(folder.glob(pattern))
-        if path.suffix.lower() in SUFFIXES and not (without and re.search(without, path.name, re.IGNORECASE))
+        for path in sorted(folder.glob("*"))  # a stated name with a slash is no pattern that glob takes
+        if fnmatch(path.name, pattern)
+        and path.suffix.lower() in SUFFIXES
+        and not (without and re.search(without, path.name, re.IGNORECASE))
     ]
     numbers = [_number(path) for path in paths]
     if len(paths) < 2 or None in numbers:

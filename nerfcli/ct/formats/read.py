@@ -1,5 +1,6 @@
 """Read a scan in any format."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,7 +30,7 @@ def read_scan(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     """
     form = recognise(path)
     if form is None:
-        if not path.exists():
+        if not os.path.exists(path):
             raise UserError(f"{path} does not exist", "give the file or folder of a scan")
         formats = ", ".join((OWN, *READERS))
         raise UserError(f"{path} is not a scan in a supported format", f"supported formats: {formats}")
