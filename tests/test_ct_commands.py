@@ -4,6 +4,7 @@ import gzip
 import json
 import re
 import shutil
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,18 +13,22 @@ import pytest
 import tifffile
 import torch
 from ellipsoids import attenuation_of_voxels, bean
+from scan_of_phantom import phantom_circle, scan_of_phantom
 from test_reconstruct import cone, scan_of
 from typer.testing import CliRunner
 
 from nerfcli.atomic import read_sealed, write_sealed
 from nerfcli.cli import app
+from nerfcli.ct.evaluate import score_projections, score_volume
 from nerfcli.ct.export import VolumeFile, export_scan, read_volume, write_volume
+from nerfcli.ct.formats.assemble import axis_column
+from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.grid import VoxelGrid, centred_grid
 from nerfcli.ct.likelihood import Gaussian, Poisson
-from nerfcli.ct.marks import UNSEEN
+from nerfcli.ct.marks import UNSEEN, marks
 from nerfcli.ct.recognise import DESCRIPTION
 from nerfcli.ct.render import residual_of, slice_of
-from nerfcli.ct.result import ReconstructionSettings, load_reconstruction
+from nerfcli.ct.result import ReconstructionSettings, load_reconstruction, save_reconstruction
 from nerfcli.ct.result import scan_of as scan_behind
 from nerfcli.ct.scan import save_scan
 from nerfcli.ct.train import train_scan
@@ -182,13 +187,21 @@ def test_resume_goes_on_from_the_volume(bean_run: Path, tmp_path: Path) -> None:
     fixed = ("--centre", "0", "--tilt", "0", "--tv", "1", "-o", run)
     assert call("train", scan, "--passes", "2", *fixed)[0] == 0
     assert load_reconstruction(run).passes == 2
+    decisions = load_reconstruction(run).decisions
+    assert any("model error" in sentence for sentence in decisions)
     code, _, err = call("train", scan, "--passes", "5", "--resume", *fixed)
     assert code == 0, err
     assert load_reconstruction(run).passes == 5
+    assert load_reconstruction(run).decisions == decisions
     before = (run / "reconstruction.json").read_bytes()
-    again = call("train", scan, "--passes", "5", "--resume", *fixed)[2]
-    assert "is kept: it is complete" in again
-    assert (run / "reconstruction.json").read_bytes() == before
+    for passes, others, code, words in (
+        ("5", (), 0, "is kept: it is complete"),
+        ("3", (), 0, "is kept: it has 5 passes in "),
+        ("9", ("--tv", "2", "--centre", "1"), 3, "another reconstruction; it differs in --tv, --centre"),
+    ):
+        found, _, err = call("train", scan, "--passes", passes, "--resume", *fixed, *others)
+        assert (found, words in err) == (code, True), err
+        assert (run / "reconstruction.json").read_bytes() == before
 
 
 def test_an_interrupted_fit_is_not_complete_and_resume_goes_on_from_it(bean_run: Path, tmp_path: Path) -> None:
@@ -218,6 +231,62 @@ def test_an_interrupted_fit_is_not_complete_and_resume_goes_on_from_it(bean_run:
     assert (result.passes, result.complete) == (3, True)
     assert result.seconds > interrupted.seconds
     assert "is kept: it is complete" in call(*command)[2]
+
+
+def test_an_interrupt_between_fit_and_save_waits(
+    bean_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(geometry: ScanGeometry, grid: VoxelGrid) -> np.ndarray:
+        signal.raise_signal(signal.SIGINT)
+        return marks(geometry, grid)
+
+    monkeypatch.setattr("nerfcli.ct.train.marks", interrupted)
+    settings = ReconstructionSettings(passes=1, voxel_size=3.0, centre=0.0, tilt=0.0, air=False)
+    with pytest.raises(KeyboardInterrupt):
+        train_scan(bean_run.with_name("bean"), Output(tmp_path / "run"), settings)
+    assert load_reconstruction(tmp_path / "run").complete
+
+
+def test_a_save_that_fails_leaves_the_earlier_run(bean_run: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(bean_run, tmp_path / "run")
+    result = load_reconstruction(run)
+    with pytest.raises(ValueError, match="Object arrays"):
+        save_reconstruction(run, replace(result, volume=2 * result.volume, marks=np.array([object()])))
+    np.testing.assert_array_equal(load_reconstruction(run).volume, load_reconstruction(bean_run).volume)
+
+
+def test_centre_is_where_doctor_says(tmp_path: Path) -> None:
+    """Known truth: the axis is 2.5 columns before the stated one; what is read off the sentence leads to it."""
+    circle = phantom_circle(views=48, columns=48)
+    scan = scan_of_phantom(replace(circle, column_shift=2.5), stated=circle, photons=3e4)
+    save_scan(tmp_path / "scan", scan)
+    train = ("train", tmp_path / "scan", "--passes", "1", "--tilt", "0", "-o")
+    code, _, err = call(*train, tmp_path / "estimated")
+    assert code == 0, err
+    found = re.search(r"axis at column (\S+) ± \S+; the scan states (\S+)", err)
+    assert found is not None
+    column, stated = float(found[1]), float(found[2])
+    assert (column, stated) == (pytest.approx(21.0, abs=0.1), 23.5)
+    code, _, err = call(*train, tmp_path / "set", "--centre", f"{column - stated:.2f}")
+    assert code == 0, err
+    for run in ("estimated", "set"):
+        used = load_reconstruction(tmp_path / run).used
+        assert axis_column(scan.geometry.corrected(used["centre"], 0.0)) == pytest.approx(column, abs=0.006)
+
+
+def test_scores_that_do_not_exist_are_none() -> None:
+    """JSON has no NaN: a held-out view without usable pixels, none with any, and volumes too small for SSIM."""
+    scan = scan_of(cone(rows=4, columns=8, pixel=4.0), held_out=(0, 6))
+    grid = centred_grid((18.0, 18.0, 15.0), 3.0)
+    usable = np.ones(scan.values.shape, bool)
+    usable[6] = False
+    found = score_projections(replace(scan, usable=usable), scan.geometry, torch.zeros(grid.shape), grid)
+    assert found is not None
+    assert found.chi_square_of_view == (pytest.approx(found.chi_square), None)
+    usable[0] = False
+    assert score_projections(replace(scan, usable=usable), scan.geometry, torch.zeros(grid.shape), grid) is None
+    small = np.ones(grid.shape)
+    assert score_volume(small, grid, small, grid).ssim is None
 
 
 def test_a_hash_grid_of_an_earlier_version_is_refused(bean_run: Path, tmp_path: Path) -> None:
@@ -317,6 +386,20 @@ def test_the_format_and_the_attenuation_of_water_are_used_and_checked(bean_run: 
         ("--water", "nan"),
     ):
         assert call("export", run, "--overwrite", *options)[0] == 2
+
+
+def test_export_from_inside_a_run_replaces_the_volume_and_its_marks(
+    bean_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = shutil.copytree(bean_run, tmp_path / "bean-run")
+    monkeypatch.chdir(run)
+    result = load_reconstruction(run)
+    paths = [str(tmp_path / f"bean-run-volume{end}.nrrd") for end in ("", "-marks")]
+    for value, written in ((4, paths), (0, paths[:1])):
+        save_reconstruction(run, replace(result, marks=np.full_like(result.marks, value)))
+        code, out, err = call("export", ".", "--overwrite")
+        assert (code, out.splitlines()) == (0, written), err
+        assert sorted(map(str, tmp_path.glob("*.nrrd"))) == sorted(written)
 
 
 def test_other_suffixes_and_types_are_refused(tmp_path: Path) -> None:

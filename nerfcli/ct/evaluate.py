@@ -39,14 +39,14 @@ class ProjectionScores:
         peak: reference line integral of the PSNR: the quantile 1 - 1e-5 of the training views.
         chi_square: mean squared misfit in units of the counting noise: 1 is the best possible; below 1, the fit has
             used held-out measurements.
-        chi_square_of_view: the same for each held-out view.
+        chi_square_of_view: the same for each held-out view; None for views without usable pixels.
     """
 
     rms: float
     psnr: float
     peak: float
     chi_square: float
-    chi_square_of_view: tuple[float, ...]
+    chi_square_of_view: tuple[float | None, ...]
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,12 @@ class VolumeScores:
 
     Args:
         psnr: 20 log10(largest true value / rms difference) in dB.
-        ssim: mean over layers across all three axes.
+        ssim: mean over layers across all three axes; None if the layers are too small.
         bias: mean difference, in 1 / unit.
     """
 
     psnr: float
-    ssim: float
+    ssim: float | None
     bias: float
 
 
@@ -182,7 +182,7 @@ def _held_out_air(scan: Scan, geometry: ScanGeometry, result: Reconstruction) ->
 def score_projections(
     scan: Scan, geometry: ScanGeometry, volume: torch.Tensor, grid: VoxelGrid, *, air: np.ndarray | None = None
 ) -> ProjectionScores | None:
-    """Compare the projections of a volume with the held-out views; return None if no view is held out.
+    """Compare the projections of a volume with the held-out views; return None if there are none with usable pixels.
 
     Args:
         geometry: corrected geometry of all its views.
@@ -201,6 +201,8 @@ def score_projections(
         measured = measured + np.log(air)[:, None].astype(np.float32)
     deviance = likelihood.deviance(predicted, torch.from_numpy(every)).numpy()
     usable = np.isfinite(deviance) & np.isfinite(measured)
+    if not usable.any():
+        return None
     rms = float(np.sqrt(np.mean((predicted.numpy() - measured)[usable] ** 2)))
     peak = float(np.nanquantile(scan.line_integrals(scan.training_views), 1 - 1e-5))
     return ProjectionScores(
@@ -208,7 +210,7 @@ def score_projections(
         float(20 * np.log10(peak / max(rms, 1e-30))),
         peak,
         float(np.mean(deviance[usable])),
-        tuple(float(np.nanmean(row)) for row in deviance),
+        tuple(float(np.nanmean(row)) if np.isfinite(row).any() else None for row in deviance),
     )
 
 
@@ -224,7 +226,7 @@ def score_volume(volume: np.ndarray, grid: VoxelGrid, true: np.ndarray, true_gri
         for k in np.unique(np.linspace(0, true.shape[axis] - 1, SSIM_LAYERS).astype(int))
     ]
     psnr = 20 * np.log10(peak / max(float(np.sqrt(np.mean(difference**2))), 1e-30))
-    return VolumeScores(float(psnr), float(np.mean(values)) if values else float("nan"), float(difference.mean()))
+    return VolumeScores(float(psnr), float(np.mean(values)) if values else None, float(difference.mean()))
 
 
 def resampled(volume: np.ndarray, grid: VoxelGrid, other: VoxelGrid) -> np.ndarray:

@@ -81,6 +81,8 @@ def export_scan(
         written.append(beside)
         for words in marks_in_words(marks):
             reporter.note(f"{beside.name}: {words}")
+    else:
+        beside.unlink(missing_ok=True)  # of the volume that is replaced
     return written
 
 

@@ -34,7 +34,7 @@ class ReconstructionSettings:
         passes: number of passes over all views; None for no limit.
         voxel_size: in the scan's unit; None for the size of a pixel at the object.
         strength: weight of total variation, see `reconstruct`.
-        centre: offset of the detector in columns; None to estimate it.
+        centre: columns that the detector is moved by; None to estimate them.
         tilt: rotation of the detector in its plane in radians; None to estimate it.
         air: whether the open beam of each view is measured in its pixels beside the object; None to decide by the data.
         threads: number of CPU threads; 0 for all.
@@ -105,36 +105,40 @@ class Reconstruction:
 
 
 def save_reconstruction(run: Path, result: Reconstruction) -> None:
-    """Write a run's folder; reconstruction.json is written last and lists the digests of the arrays.
+    """Write a run's folder; reconstruction.json is renamed last and lists the digests of the arrays.
+
+    The files of an earlier run stay until all of the new ones have been written.
 
     Raises:
         UserError: it cannot be written.
     """
-    digests = {}
-    for name, array in {VOLUME: result.volume, MARKS: result.marks}.items():
-        with atomic_path(run / name) as partial:
-            np.save(partial, array, allow_pickle=False)
-        digests[name] = array_digest(array)
-    write_sealed(
-        run / DESCRIPTION,
-        {
-            "measurement": MEASUREMENT,
-            "scan": str(result.scan),
-            "scan_digest": result.scan_digest,
-            "unit": result.unit,
-            "grid": {"shape": list(result.grid.shape), "first": list(result.grid.first), "size": result.grid.size},
-            "settings": asdict(result.settings),
-            "used": dict(result.used),
-            "decisions": list(result.decisions),
-            "passes": result.passes,
-            "seconds": result.seconds,
-            "settled": result.settled,
-            "complete": result.complete,
-            "missing_wedge_deg": result.missing_wedge_deg,
-            "arrays": digests,
-            "versions": dict(result.versions),
-        },
-    )
+    with (
+        atomic_path(run / DESCRIPTION) as description,
+        atomic_path(run / VOLUME) as volume,
+        atomic_path(run / MARKS) as marked,
+    ):
+        np.save(volume, result.volume, allow_pickle=False)
+        np.save(marked, result.marks, allow_pickle=False)
+        write_sealed(
+            description,
+            {
+                "measurement": MEASUREMENT,
+                "scan": str(result.scan),
+                "scan_digest": result.scan_digest,
+                "unit": result.unit,
+                "grid": {"shape": list(result.grid.shape), "first": list(result.grid.first), "size": result.grid.size},
+                "settings": asdict(result.settings),
+                "used": dict(result.used),
+                "decisions": list(result.decisions),
+                "passes": result.passes,
+                "seconds": result.seconds,
+                "settled": result.settled,
+                "complete": result.complete,
+                "missing_wedge_deg": result.missing_wedge_deg,
+                "arrays": {VOLUME: array_digest(result.volume), MARKS: array_digest(result.marks)},
+                "versions": dict(result.versions),
+            },
+        )
 
 
 def load_reconstruction(run: Path) -> Reconstruction:

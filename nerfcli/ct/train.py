@@ -5,7 +5,7 @@ import platform
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from nerfcli.atomic import clear_leftovers, exclusive
 from nerfcli.ct.baselines import filtered_back_projection, filtered_misfit, logarithms
 from nerfcli.ct.calibrate import air_factors, beside_object, detector_tilt, found_noise
 from nerfcli.ct.centre import FEWEST_VIEWS, centre_of
+from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.grid import VoxelGrid, grid_of_scan
 from nerfcli.ct.likelihood import Poisson, likelihood_of, with_noise
@@ -33,7 +34,8 @@ from nerfcli.ct.result import (
     save_reconstruction,
 )
 from nerfcli.ct.scan import Scan, load_scan
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, duration, listed, several
+from nerfcli.interrupts import deferred_interrupts
 from nerfcli.machine import default_memory_limit, thread_count, use_threads
 from nerfcli.notices import Progress, Reporter
 from nerfcli.output import Output
@@ -50,6 +52,9 @@ MOST_PASSES = 200
 BYTES_OF_VOXEL = 52
 # The open beam drifts if its standard deviation between views exceeds this many standard errors.
 DRIFT = 3.0
+# Options of `nerfcli ct train` by setting: what --resume may not change, and the totals that it may.
+_FIXED = {"voxel_size": "--voxel-size", "strength": "--tv", "centre": "--centre", "tilt": "--tilt", "air": "--air"}
+_TOTALS = {"budget_seconds": "--budget", "passes": "--passes"}
 
 
 def train_scan(
@@ -66,7 +71,8 @@ def train_scan(
         scan: a folder that `nerfcli ct convert` wrote.
         output: the folder to write, SCAN-run by default.
         settings: budget, and values that are not to be estimated from the scan.
-        resume: continue from the volume in the folder; start from the beginning if there is none.
+        resume: continue from the volume in the folder, whose settings other than totals are the same; start from the
+            beginning if there is none.
 
     Raises:
         UserError: the scan cannot be read, or the folder holds something else, or an interrupted fit without `resume`.
@@ -77,20 +83,10 @@ def train_scan(
     loaded = load_scan(folder)
     earlier = load_reconstruction(run) if is_reconstruction(run) and not output.overwrite else None
     if earlier is not None:
-        same = earlier.scan_digest == loaded.digest and _wanted(earlier.settings) == _wanted(settings)
-        if same and earlier.complete:
+        if reason := _reason_to_keep(run, earlier, loaded.digest, settings, resume=resume):
             again = "give a larger --budget or --passes" if resume else "add --overwrite to fit again"
-            reporter.note(f"{run} is kept: it is complete and has these settings; {again}")
+            reporter.note(f"{run} is kept: {reason}; {again}")
             return earlier
-        if same and not resume:
-            raise UserError(
-                f"{run} holds a fit that was interrupted after pass {earlier.passes}",
-                "add --resume to continue, or --overwrite to replace it",
-            )
-        if not (same or (resume and earlier.scan_digest == loaded.digest)):
-            raise UserError(
-                f"{run} holds another reconstruction", "choose another folder with --output, or add --overwrite"
-            )
     elif _holds_something(run) and not (output.overwrite and is_reconstruction(run)):
         raise UserError(f"{run} exists and is not a reconstruction", "choose another folder with --output")
     with exclusive(run / LOCK, f"nerfcli ct train is writing {run}"):
@@ -99,14 +95,7 @@ def train_scan(
             reporter.warn("photons per detector value not given: estimated from the noise of neighbouring pixels")
         threads = thread_count(settings.threads)
         use_threads(threads)
-        result, interrupt = _fit(loaded, folder, settings, earlier if resume else None, reporter.progress)
-        (run / METRICS).unlink(missing_ok=True)  # they belong to the volume that is replaced
-        save_reconstruction(run, result)
-    if interrupt is not None:
-        reporter.note(
-            f"the volume of pass {result.passes} is saved in {run}; to continue, add --resume to the same command"
-        )
-        raise interrupt
+        result = _fit(loaded, folder, run, settings, earlier, reporter)
     for sentence in result.decisions:
         reporter.note(sentence)
     return result
@@ -117,20 +106,51 @@ def _holds_something(run: Path) -> bool:
     return run.is_dir() and any(not path.name.startswith(".") for path in run.iterdir())
 
 
-def _wanted(settings: ReconstructionSettings) -> ReconstructionSettings:
-    """Return the settings without the number of threads, which does not make a different reconstruction."""
-    return replace(settings, threads=0)
+def _reason_to_keep(
+    run: Path, earlier: Reconstruction, scan_digest: str, settings: ReconstructionSettings, *, resume: bool
+) -> str:
+    """Return why an earlier reconstruction is kept as it is; "" if it is to be continued.
+
+    Raises:
+        UserError: it is another reconstruction, or an interrupted one and `resume` is not set.
+    """
+    made, given = asdict(earlier.settings), asdict(settings)
+    changed = [] if earlier.scan_digest == scan_digest else ["the scan"]
+    changed += [
+        option for name, option in (_FIXED if resume else _FIXED | _TOTALS).items() if made[name] != given[name]
+    ]
+    if changed:
+        raise UserError(
+            f"{run} holds another reconstruction; it differs in {listed(changed)}",
+            "give the same settings, choose another folder with --output, or add --overwrite",
+        )
+    if not (earlier.complete or resume):
+        raise UserError(
+            f"{run} holds a fit that was interrupted after pass {earlier.passes}",
+            "add --resume to continue, or --overwrite to replace it",
+        )
+    if earlier.complete and all(made[name] == given[name] for name in _TOTALS):
+        return "it is complete and has these settings"
+    budget = settings.budget_seconds if earlier.complete else None  # an interrupted fit may have exceeded its own
+    if earlier.passes >= (settings.passes or math.inf) or earlier.seconds >= (budget or math.inf):
+        return f"it has {several(earlier.passes, 'pass', 'passes')} in {duration(earlier.seconds)} already"
+    return ""
 
 
 def _fit(
-    scan: Scan, folder: Path, settings: ReconstructionSettings, earlier: Reconstruction | None, progress: Progress
-) -> tuple[Reconstruction, KeyboardInterrupt | None]:
-    """Fit the volume, and return what interrupted the fit, if anything; before the fit, an interrupt is passed on."""
+    scan: Scan,
+    folder: Path,
+    run: Path,
+    settings: ReconstructionSettings,
+    earlier: Reconstruction | None,
+    reporter: Reporter,
+) -> Reconstruction:
+    """Fit the volume and save it; an interrupt of the fit or the save is passed on when the volume is saved."""
     begun = time.perf_counter() - (0.0 if earlier is None else earlier.seconds)
-    digest, decisions = scan.digest, list[str]()
+    digest, decisions = scan.digest, [] if earlier is None else list(earlier.decisions)
     # Check memory first: correcting the geometry takes seconds, and hardly changes the number of voxels.
     _fits_memory(grid_of_scan(scan.geometry, settings.voxel_size) if earlier is None else earlier.grid)
-    used = earlier.used if earlier is not None else _estimates(scan, settings, decisions, progress)
+    used = earlier.used if earlier is not None else _estimates(scan, settings, decisions, reporter.progress)
     geometry = scan.geometry.corrected(float(used["centre"]), float(used["tilt"]))
     grid = earlier.grid if earlier is not None else grid_of_scan(geometry, settings.voxel_size)
     lower = float(used.get("noise_lower", 1.0))
@@ -150,29 +170,44 @@ def _fit(
         if lower > 1:
             fit = _better_start(fit, problem, logarithms(scan, used["air"]))
     kept, interrupt = deque([fit], maxlen=1), None
-    try:
-        fit = reconstruct(
-            *(problem, fit),
-            strength=float(used["strength"]),
-            passes=MOST_PASSES if settings.passes is None else max(settings.passes - fit.passes, 1),
-            seconds=seconds_left(settings.budget_seconds, begun),
-            progress=progress,
-            keep=kept.append,
+    with deferred_interrupts() as interrupts:
+
+        def on_step(fraction: float, words: str) -> None:
+            reporter.progress(fraction, words)
+            interrupts.raise_if_pending()
+
+        try:
+            fit = reconstruct(
+                *(problem, fit),
+                strength=float(used["strength"]),
+                passes=MOST_PASSES if settings.passes is None else settings.passes - fit.passes,
+                seconds=seconds_left(settings.budget_seconds, begun),
+                progress=on_step,
+                keep=kept.append,
+            )
+        except KeyboardInterrupt as caught:
+            fit, interrupt = kept[-1], caught
+        found = marks(problem.geometry, grid)
+        decisions += [f"{words}; they are marked" for words in marks_in_words(found, (UNSEEN, TRUNCATED))]
+        wedge = missing_wedge_deg(problem.geometry)
+        if wedge > 0:
+            decisions.append(f"missing wedge of {wedge:.0f} degrees: edges along its directions are not determined")
+        result = Reconstruction(
+            *(fit.volume.numpy(), found, grid, scan.unit, folder, digest, settings, used),
+            tuple(dict.fromkeys(decisions)),  # those on marks and the wedge are the same after --resume
+            *(fit.passes, time.perf_counter() - begun, fit.settled, wedge),
+            {"nerfcli": __version__, "python": platform.python_version(), "torch": version("torch")},
+            complete=interrupt is None,
         )
-    except KeyboardInterrupt as caught:
-        fit, interrupt = kept[-1], caught
-    found = marks(problem.geometry, grid)
-    decisions += [f"{words}; they are marked" for words in marks_in_words(found, (UNSEEN, TRUNCATED))]
-    wedge = missing_wedge_deg(problem.geometry)
-    if wedge > 0:
-        decisions.append(f"missing wedge of {wedge:.0f} degrees: edges along its directions are not determined")
-    result = Reconstruction(
-        *(fit.volume.numpy(), found, grid, scan.unit, folder, digest, settings, used, tuple(decisions)),
-        *(fit.passes, time.perf_counter() - begun, fit.settled, wedge),
-        {"nerfcli": __version__, "python": platform.python_version(), "torch": version("torch")},
-        complete=interrupt is None,
-    )
-    return result, interrupt
+        (run / METRICS).unlink(missing_ok=True)  # they belong to the volume that is replaced
+        save_reconstruction(run, result)
+        if interrupt is not None:
+            reporter.note(
+                f"the volume of pass {result.passes} is saved in {run}; to continue, add --resume to the same command"
+            )
+            raise interrupt
+        interrupts.raise_if_pending()
+    return result
 
 
 def _estimates(
@@ -229,7 +264,11 @@ def _geometry(
         found = centre_of(highest_contrast_row(scan, scan.training_views).thinned())
         centre = found.shift if found.is_off else 0.0
         if found.is_off:
-            decisions.append(f"centre of rotation: shifted by {found.shift:+.2f} ± {found.error:.2f} columns")
+            stated = axis_column(scan.geometry)
+            decisions.append(
+                f"centre of rotation: axis at column {stated - found.shift:.2f} ± {found.error:.2f}; "
+                f"the scan states {stated:.2f}"
+            )
     if tilt is None:
         progress(0.0, "detector tilt")
         # At most half of the time for estimates, so that the noise is judged too.

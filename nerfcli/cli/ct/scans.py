@@ -215,7 +215,10 @@ class FitOptions:
         ),
     ] = "auto"
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue from the volume of the run to the new total; without one, start.")
+        bool,
+        typer.Option(
+            "--resume", help="Continue the run, with its other settings, to the new total; without one, start."
+        ),
     ] = False
 
     def settings(self, threads: int) -> "ReconstructionSettings":
@@ -233,7 +236,7 @@ class FitOptions:
             passes=self.passes,
             voxel_size=self.voxel_size,
             strength=self.tv,
-            centre=self.centre,
+            centre=None if self.centre is None else -self.centre,  # the detector is moved the other way
             tilt=None if self.tilt is None else math.radians(self.tilt),
             air=_AIR[self.air],
             threads=thread_count(threads),

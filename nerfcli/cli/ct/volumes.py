@@ -11,7 +11,7 @@ from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Overwrite, Printing, Threads, Writing, finite, one_of
 from nerfcli.ct.recognise import VOLUMES
 from nerfcli.machine import Resources
-from nerfcli.output import Output
+from nerfcli.output import Output, beside
 
 if TYPE_CHECKING:
     from nerfcli.ct.evaluate import ScanEvaluation
@@ -80,7 +80,8 @@ def _print_numbers(run: Path, evaluation: "ScanEvaluation", console: Console) ->
 
 
 def _cells(scores: dict[str, Any] | None, digits: dict[str, int]) -> list[str]:
-    return ["-" if scores is None else f"{scores[name]:.{count}f}" for name, count in digits.items()]
+    found = scores or {}
+    return ["-" if found.get(name) is None else f"{found[name]:.{count}f}" for name, count in digits.items()]
 
 
 @command
@@ -174,7 +175,7 @@ def export(
     def work(given: Given) -> None:
         from nerfcli.ct.export import export_scan
 
-        usual = given.path.with_name(f"{given.path.name}-volume.{suffix}")
+        usual = beside(given.path, f"-volume.{suffix}")
         target = writing.named(given, usual)
         if form is not None and target.at(usual).suffix.lower() != f".{suffix}":
             message = f"{form!r} contradicts -o {writing.output}; remove one of them"
