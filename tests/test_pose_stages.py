@@ -24,9 +24,9 @@ from in_this_process import worker_in_this_process
 
 import nerfcli
 from nerfcli.errors import OUT_OF_MEMORY, UserError
-from nerfcli.machine import default_memory_limit, resident_bytes
+from nerfcli.machine import default_memory_limit, resident_bytes, thread_count
 from nerfcli.poses import structure_from_motion
-from nerfcli.poses.input.job import read_stage, write_stage
+from nerfcli.poses.input.job import read_job, read_stage, write_stage
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.structure_from_motion import estimate_poses, plan_poses
@@ -282,6 +282,18 @@ def test_without_its_database_a_scene_is_still_a_scene(photos: Path, again: Path
     assert {path.name for path in again.iterdir()} == {"sparse", "scene.json", "poses_report.json"}
     assert is_same_scene(again, photos, ONE_THREAD)
     assert not is_same_scene(again, photos, replace(ONE_THREAD, max_features=700))
+
+
+def test_the_worker_gets_the_number_of_threads(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A pool of threads takes no -1, which stands for all of them."""
+
+    def run_worker(job_path: Path, **options: object) -> None:
+        assert read_job(job_path).threads == options["threads"] == thread_count(0)
+        raise KilledError
+
+    monkeypatch.setattr(structure_from_motion, "run_worker", run_worker)
+    with pytest.raises(KilledError):
+        estimate(photos, tmp_path / "scene", replace(ONE_THREAD, threads=-1))
 
 
 def test_two_calls_on_one_scene_do_not_meet(photos: Path, tmp_path: Path):

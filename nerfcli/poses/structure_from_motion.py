@@ -5,7 +5,6 @@ The photos are not copied into the scene and not changed. The cameras refer to u
 upright copies of photos that are stored rotated.
 """
 
-import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -121,8 +120,8 @@ def plan_poses(
         pairing = choose_pairs(photos.photos, rule=settings.pairing)
     else:
         pairing = read_pairs(Path(settings.pairs_file), photos)
-    threads = settings.threads if settings.threads > 0 else os.cpu_count() or 1
-    return photos, grouped, pairing, make_plan(photos, pairing, _search_settings(settings, grouped), threads=threads)
+    plan = make_plan(photos, pairing, _search_settings(settings, grouped), threads=settings.cores)
+    return photos, grouped, pairing, plan
 
 
 def _search_settings(settings: PoseSettings, grouped: PhotoGroups) -> PoseSettings:
@@ -182,7 +181,7 @@ def _lay_out(
         max_image_size=settings.max_image_size,
         max_features=settings.max_features,
         seed=settings.seed,
-        threads=settings.threads,
+        threads=settings.cores,
         masks=lay_out_masks(photos, files, masks, folder=work / "masks", notify=notify) if masks else (),
         held_out=tuple(sorted(photos.names.index(name) for name in held_out)),
     )

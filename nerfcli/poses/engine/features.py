@@ -111,7 +111,7 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
     Each pair's random numbers start from the seed, so its result does not depend on earlier work. Returns a note if
     matching was cut short after ten times the planned time, so that the last pairs have no matches.
     """
-    planned = matching_seconds(len(pairs), max_features=job.max_features) / max(job.threads, 1)
+    planned = matching_seconds(len(pairs), max_features=job.max_features) / job.threads
     most, start = limit_seconds(planned), time.perf_counter()
     options = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()

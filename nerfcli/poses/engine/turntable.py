@@ -78,7 +78,7 @@ class _Photos:
     def read(self, numbers: Collection[int]) -> None:
         """Read photos that were not read before, several at a time."""
         missing = sorted(set(numbers) - self._read.keys())
-        with ThreadPoolExecutor(max(self._job.threads, 1)) as pool:
+        with ThreadPoolExecutor(self._job.threads) as pool:
             self._read.update(zip(missing, pool.map(self._photo, missing), strict=True))
 
     def _photo(self, number: int) -> _Photo:

@@ -82,7 +82,8 @@ class Job:
     pairs. variant: "" or the name of an attempt with other features, which has its own database and stages:
     `replace(job, variant="full-size", max_image_size=...)`. masks: one per photo, or none at all for a capture without
     masks; their pictures are in mask_folder. held_out: photos that are placed last, with everything else fixed.
-    skipped_checks: (name, reason) of checks that ended an earlier process. The other fields are as in `PoseSettings`.
+    skipped_checks: (name, reason) of checks that ended an earlier process. threads: their number, never -1. The other
+    fields are as in `PoseSettings`.
     """
 
     folder: str
@@ -113,7 +114,7 @@ class Job:
         return Path(self.folder) / "masks"
 
     def stage_file(self, name: str) -> Path:
-        """Return the path of a stage on the way to the database, see `stages`."""
+        """Return the path of a stage on the way to the database."""
         return Path(self.folder) / f"{self.variant}{'-' if self.variant else ''}{name}.json"
 
     @property

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 from nerfcli.captures.holdout import DEFAULT_HOLDOUT
+from nerfcli.machine import thread_count
 from nerfcli.poses.input.pairs import PAIRINGS
 
 # Choices of `camera_model`.
@@ -55,6 +56,11 @@ class PoseSettings:
     strict: bool = False
     accept_refused: bool = False
     subfolders: bool = False
+
+    @property
+    def cores(self) -> int:
+        """The number of threads to use."""
+        return thread_count(max(self.threads, 0))
 
 
 def for_panoramas(settings: PoseSettings) -> PoseSettings:
