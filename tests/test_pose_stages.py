@@ -30,7 +30,7 @@ from nerfcli.poses.input.job import read_job, read_stage, write_stage
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.structure_from_motion import estimate_poses, plan_poses
-from nerfcli.poses.workspace import database_bytes, is_same_scene, workspace
+from nerfcli.poses.workspace import database_bytes, hash_inputs, is_same_scene, workspace
 
 # A fixed lens model: choosing one would only add adjustments.
 ONE_THREAD = PoseSettings(max_features=200, max_image_size=192, threads=1, camera_model="SIMPLE_RADIAL")
@@ -282,6 +282,27 @@ def test_without_its_database_a_scene_is_still_a_scene(photos: Path, again: Path
     assert {path.name for path in again.iterdir()} == {"sparse", "scene.json", "poses_report.json"}
     assert is_same_scene(again, photos, ONE_THREAD)
     assert not is_same_scene(again, photos, replace(ONE_THREAD, max_features=700))
+
+
+def test_a_scene_is_the_same_as_long_as_its_photos_and_masks_are(photos: Path, again: Path, tmp_path: Path):
+    """They keep their names; a report of an earlier version, without hashes, knows only these."""
+    path, masks = again / "poses_report.json", tmp_path / "masks"
+    masks.mkdir()
+    (masks / f"{NAMES[0]}.png").write_bytes(b"white")
+    settings = replace(ONE_THREAD, masks=str(masks))
+    report = json.loads(path.read_text())
+    report["settings"]["masks"] = str(masks)
+    report["matching"] |= hash_inputs(photos, settings)
+    path.write_text(json.dumps(report))
+    for file in (photos / NAMES[0], masks / f"{NAMES[0]}.png"):
+        assert is_same_scene(again, photos, settings)
+        content = file.read_bytes()
+        file.write_bytes(content + b"exported again")
+        assert not is_same_scene(again, photos, settings)
+        file.write_bytes(content)
+    report["matching"] = {"rule": "retrieval", "pairs": 28}
+    path.write_text(json.dumps(report))
+    assert is_same_scene(again, photos, settings)
 
 
 def test_the_worker_gets_the_number_of_threads(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

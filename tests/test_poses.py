@@ -20,6 +20,7 @@ from nerfcli.poses.engine import supervise
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.structure_from_motion import estimate_poses
+from nerfcli.poses.workspace import hash_inputs, is_same_scene
 
 FAST = PoseSettings(max_features=500, max_image_size=384, threads=2)
 
@@ -44,6 +45,7 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> Solved:
     folder = tmp_path_factory.mktemp("capture")
     photos, scene_dir = folder / "my photos", folder / "corner"
     write_capture(photos)
+    (photos / "view 7.cr3").write_bytes(b"raw")
     notes: list[str] = []
     stages: list[tuple[str, int, int]] = []
     report = estimate_poses(
@@ -95,12 +97,13 @@ def test_points_project_onto_the_upright_picture_where_their_colour_is(solved: S
 
 def test_every_file_is_registered_or_has_its_reason(solved: Solved):
     images = {image.name: image for image in solved.report.images}
-    assert sorted(images) == sorted([*NAMES, "notes.jpg", "wall.png"])
+    assert sorted(images) == sorted([*NAMES, "notes.jpg", "view 7.cr3", "wall.png"])
     assert all(images[name].registered and images[name].reason is None for name in NAMES)
     assert images["notes.jpg"].reason == "unreadable: not a readable picture"
     assert images["wall.png"].reason == "too few features (0 in 480x360 pixels)"
-    assert (solved.report.registered, solved.report.total) == (7, 9)
+    assert (solved.report.registered, solved.report.total) == (7, 10)
     assert "notes.jpg is skipped: not a readable picture" in solved.notes
+    assert is_same_scene(solved.scene, solved.photos, FAST)
 
 
 def test_the_scene_folder_holds_the_model_and_of_the_work_what_helps_the_next(solved: Solved):
@@ -127,7 +130,7 @@ def test_the_report_file_has_the_promised_keys(solved: Solved):
     assert report["models"][0] == report["registered"] == 7
     assert report["settings"]["max_features"] == 500
     assert report["versions"]["pycolmap"] == pycolmap.__version__
-    assert report["matching"] == {"rule": "retrieval", "pairs": 25}
+    assert report["matching"] == {"rule": "retrieval", "pairs": 25, **hash_inputs(solved.photos, FAST)}
 
 
 def test_a_blank_photo_costs_no_second_attempt(solved: Solved):

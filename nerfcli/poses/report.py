@@ -40,9 +40,10 @@ class PosesReport:
     parts: sizes of the groups of photos connected by matches.
     seconds: per stage, for the call that wrote the report; time spent in earlier calls is not included. models: the
     sizes of all models found, the kept one first. attempts: the result of each mapping attempt. matching: the rule
-    for pairs, and their number. points: number of points of the kept model. intrinsics: the given intrinsics, see
-    `cameras.PhotoGroups`. strict: how held-out photos were placed afterwards, see `strict.place_held_out`. components:
-    each model's photos and why it is not joined to the largest, ordered by size.
+    for pairs, their number, and hashes of the photos, masks and files that were used. points: number of points of the
+    kept model. intrinsics: the given intrinsics, see `cameras.PhotoGroups`. strict: how held-out photos were placed
+    afterwards, see `strict.place_held_out`. components: each model's photos and why it is not joined to the largest,
+    ordered by size.
     not_computed: checks that could not be computed, and why. not_finite: where the report has null for a number that
     was not finite.
     cut_short: what was stopped because it took far longer than planned.

@@ -32,7 +32,7 @@ from nerfcli.poses.report import PosesReport, closing_notes, make_report, refusa
 from nerfcli.poses.workspace import (
     POINTS_FILE,
     check_destination,
-    hash_named_files,
+    hash_inputs,
     keep_refused,
     publish,
     read_json,
@@ -79,7 +79,7 @@ def estimate_poses(
     for note in photo_notes(photos, grouped):
         notify(note)
     planned(plan)
-    work = scene_dir / "work"
+    work, hashes = scene_dir / "work", hash_inputs(photos_dir, settings)
     with workspace(scene_dir) as lock:
         job = _lay_out(
             photos, _search_settings(settings, grouped), grouped=grouped, pairing=pairing, work=work, notify=notify
@@ -88,7 +88,7 @@ def estimate_poses(
         _run(job, work, solve, notify)
         result = read_json(work / "result.json")["content"]  # written by the worker, or complete from before
         result["seconds"]["total"] = round(time.perf_counter() - start, 3)
-        matching = {"rule": pairing.rule, "pairs": result["pairs"], **hash_named_files(settings)}
+        matching = {"rule": pairing.rule, "pairs": result["pairs"], **hashes}
         report = make_report(photos, settings, result=result, matching=matching, intrinsics=grouped.given)
         if error := refusal(report, photos_dir):
             if not (settings.accept_refused and report.models):

@@ -1,6 +1,6 @@
 """A scene's folder while the scene is under construction, and the step that turns it into a scene.
 
-    SCENE/work/          the completed stages: see `stages`
+    SCENE/work/          the completed stages: see `input.job`
     SCENE/database.db    features and matches, for the next call; COLMAP can read it
     SCENE/refused-model/ a model that the checks refused, instead of a scene
     SCENE/scene.json     written last: with it the folder is a scene
@@ -9,8 +9,10 @@ The process that works in the folder holds its lock. If it is killed, the lock i
 """
 
 import json
+import os
 import shutil
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -21,7 +23,8 @@ from nerfcli.captures.calibration import Calibration
 from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.errors import UserError
 from nerfcli.photos.images import list_photos, name_in
-from nerfcli.poses.input.job import database_path, file_key
+from nerfcli.photos.masks import find_mask
+from nerfcli.poses.input.job import database_path, file_key, stage_key
 from nerfcli.poses.input.settings import PoseSettings
 
 _LOCK = "poses.lock"
@@ -118,7 +121,8 @@ def is_same_scene(
 def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: Calibration | None) -> bool:
     report = read_json(scene_dir / "poses_report.json")
     made = scene_dir.resolve() / read_json(scene_dir / SCENE_FILE)["image_folder"]
-    names = [name_in(photos_dir, path) for path in list_photos(photos_dir, subfolders=settings.subfolders).pictures]
+    listed = list_photos(photos_dir, subfolders=settings.subfolders)
+    names = [name_in(photos_dir, path) for path in (*listed.pictures, *listed.unreadable)]
     earlier = report.get("intrinsics")
     files = {key: value for key, value in report["matching"].items() if key.endswith("_key")}
     made_with = asdict(PoseSettings()) | report["settings"]  # settings newer than the report had their defaults
@@ -127,15 +131,26 @@ def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given
         made.resolve() == photos_dir.resolve()
         and sorted(image["name"] for image in report["images"]) == sorted(names)
         and (earlier and earlier["key"]) == (given and given.key)
-        and files == hash_named_files(settings)
         and all(made_with[key] == value for key, value in wanted.items())
+        and files.items() <= hash_inputs(photos_dir, settings).items()
     )
 
 
-def hash_named_files(settings: PoseSettings) -> dict[str, str]:
-    """Return hashes of the files that the settings name, for the report."""
-    files = {"pairs_file_key": settings.pairs_file, "holdout_key": settings.holdout}
-    return {key: file_key(Path(file)) for key, file in files.items() if file is not None and Path(file).is_file()}
+def hash_inputs(photos_dir: Path, settings: PoseSettings) -> dict[str, str]:
+    """Return hashes of the photos, of their masks, and of the files that the settings name, for the report."""
+    pictures = list_photos(photos_dir, subfolders=settings.subfolders).pictures
+    named = {"pairs_file_key": settings.pairs_file, "holdout_key": settings.holdout}
+    keys = {key: file_key(Path(file)) for key, file in named.items() if file is not None and Path(file).is_file()}
+    of_many = {"photos_key": pictures}
+    if settings.masks is not None:
+        masks = (find_mask(name_in(photos_dir, path), Path(settings.masks)) for path in pictures)
+        of_many["masks_key"] = [path for path in masks if path is not None]
+
+    def named_key(path: Path) -> tuple[str, str]:
+        return path.name, file_key(path) if os.access(path, os.R_OK) else ""
+
+    with ThreadPoolExecutor() as readers:
+        return keys | {key: stage_key(*readers.map(named_key, paths)) for key, paths in of_many.items()}
 
 
 def read_json(path: Path) -> dict[str, Any]:
