@@ -11,9 +11,7 @@ from test_cli import USAGE, write_photos
 from nerfcli.cli.options import bytes_from_text
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.poses import structure_from_motion
-from nerfcli.poses.engine import supervise
 from nerfcli.poses.input.settings import QUALITIES, PoseSettings
-from nerfcli.workflows.poses import _STAGES
 
 
 @pytest.mark.parametrize(
@@ -74,10 +72,6 @@ def test_the_quality_goes_to_the_settings(tmp_path: Path, monkeypatch: pytest.Mo
         assert nerfcli(command, photos, "--quality", quality).exit_code == BAD_INPUT
     assert calls == [QUALITIES["fast"], QUALITIES["best"]]
     assert nerfcli(command, photos, "--quality", "superb").exit_code == USAGE
-
-
-def test_progress_has_words_for_every_stage_of_the_worker():
-    assert set(_STAGES) == {"read", *supervise._STAGES}
 
 
 def test_pairs_of_unknown_photos_are_bad_input(tmp_path: Path):

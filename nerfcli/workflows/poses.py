@@ -11,29 +11,11 @@ from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
 from nerfcli.output import Output
 from nerfcli.poses import structure_from_motion
-from nerfcli.poses.input.plan import Plan, TimeEstimate
+from nerfcli.poses.input.plan import STAGES, Plan, TimeEstimate
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.input.video_frames import extract_frames, frames_folder
 from nerfcli.poses.structure_from_motion import photo_notes, plan_poses
 from nerfcli.poses.workspace import is_same_scene
-
-_STAGES = {
-    "read": "photos read",
-    "extract": "photos, features",
-    "enlarge": "photos, finer features",
-    "faint": "photos, faint features",
-    "faint-enlarged": "photos, faint finer features",
-    "features": "features per photo",
-    "pair": "photos, finding similar ones",
-    "match": "pairs compared",
-    "matches": "verified matches per photo",
-    "map": "photos registered",
-    "merge": "sub-models, merging them",
-    "locate": "trials to locate single photos",
-    "check": "checks of the poses",
-    "stabilise": "trials of principal points",
-    "settle": "adjustments of principal points",
-}
 
 
 def estimate_poses(
@@ -124,7 +106,7 @@ def _estimated(
         fraction, left = (0.0, None) if time_estimate is None else time_estimate.update(stage, done, total)
         about = "" if left is None else f", about {duration(left)} left"
         amount = f"{done}" if stage == "matches" else f"{done} of {total}"
-        reporter.progress(fraction, f"({amount} {_STAGES[stage]}{about})")
+        reporter.progress(fraction, f"({amount} {STAGES[stage].counted}{about})")
 
     report = structure_from_motion.estimate_poses(
         folder,
@@ -163,7 +145,7 @@ def plan_scene(
     photos, grouped, _, plan = plan_poses(
         folder,
         settings=settings,
-        progress=lambda stage, done, total: reporter.progress(done / max(total, 1), _STAGES[stage]),
+        progress=lambda stage, done, total: reporter.progress(done / max(total, 1), STAGES[stage].counted),
         given=_given_intrinsics(intrinsics, folder),
     )
     for note in photo_notes(photos, grouped):

@@ -15,24 +15,9 @@ from typing import Any
 from nerfcli import child
 from nerfcli.errors import OUT_OF_MEMORY, UserError, duration
 from nerfcli.machine import resident_bytes
+from nerfcli.poses.input.plan import STAGES
 from nerfcli.poses.judge.checks import UNDERWAY
 
-_STAGES = {
-    "extract": "finding features",
-    "enlarge": "extracting finer features",
-    "faint": "extracting faint features",
-    "faint-enlarged": "extracting faint features at double size",
-    "features": "counting features",
-    "pair": "choosing pairs",
-    "match": "matching photos",
-    "matches": "counting matches",
-    "map": "placing photos",
-    "merge": "merging sub-models",
-    "locate": "locating single photos",
-    "check": "checking the poses",
-    "stabilise": "trying a principal point for each photo",
-    "settle": "adjusting with a principal point for each photo",
-}
 _GO_ON = "completed work is kept; run the same command again to continue"
 _LESS_MEMORY = "use smaller photos (--max-size), fewer features (--quality fast) or fewer threads (--threads)"
 
@@ -86,7 +71,7 @@ def run_worker(
                 if "note" in message:
                     notify(message["note"])
                     continue
-                stage = f"{_STAGES[message['stage']]} ({message['done']} of {message['total']} done)"
+                stage = f"{STAGES[message['stage']].doing} ({message['done']} of {message['total']} done)"
                 progress(message["stage"], message["done"], message["total"])
         finally:
             messages.close()

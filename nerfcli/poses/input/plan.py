@@ -7,13 +7,41 @@ import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from nerfcli.errors import duration
 from nerfcli.poses.input.pairs import Pairing, retrieval_feature_count
 from nerfcli.poses.input.photos import Photos
 from nerfcli.poses.input.settings import PoseSettings
 
+
+class Stage(NamedTuple):
+    """Words for a stage: what is being done, what is counted, and what a plan calls it, if it is in one."""
+
+    doing: str
+    counted: str
+    planned: str = ""
+
+
+# All stages, in the order of the work.
+STAGES = {
+    "read": Stage("reading photos", "photos read"),
+    "extract": Stage("finding features", "photos, features", "features"),
+    "enlarge": Stage("extracting finer features", "photos, finer features"),
+    "faint": Stage("extracting faint features", "photos, faint features"),
+    "faint-enlarged": Stage("extracting faint features at double size", "photos, faint finer features"),
+    "features": Stage("counting features", "features per photo"),
+    "pair": Stage("choosing pairs", "photos, finding similar ones", "pairs"),
+    "match": Stage("matching photos", "pairs compared", "matches"),
+    "matches": Stage("counting matches", "verified matches per photo"),
+    "map": Stage("placing photos", "photos registered", "poses"),
+    "merge": Stage("merging sub-models", "sub-models, merging them"),
+    "locate": Stage("locating single photos", "trials to locate single photos"),
+    "check": Stage("checking the poses", "checks of the poses", "checks"),
+    "stabilise": Stage("trying a principal point for each photo", "trials of principal points", "principal points"),
+    "settle": Stage("adjusting with a principal point for each photo", "adjustments of principal points"),
+}
+_ORDER = tuple(STAGES)
 # Time of the further searches for features, relative to the first, see `engine.features`.
 _SEARCH_FACTORS = {"enlarge": 3.0, "faint": 1.0, "faint-enlarged": 3.0}
 # A stage that took less than planned shortens the others by no more than this factor. Replays of 14 captures are within
@@ -21,8 +49,6 @@ _SEARCH_FACTORS = {"enlarge": 3.0, "faint": 1.0, "faint-enlarged": 3.0}
 _LEAST_STRETCH = 0.8
 # Least time limit of a step, however few the photos.
 LEAST_LIMIT_SECONDS = 120
-# All stages that take time, in the order of the work.
-_ORDER = ("extract", *_SEARCH_FACTORS, "pair", "match", "map", "merge", "locate", "check", "stabilise", "settle")
 
 
 @dataclass(frozen=True)
@@ -48,21 +74,10 @@ class Plan:
 
     def describe(self) -> str:
         """Describe the plan in one sentence."""
-        times = ", ".join(f"{_WORDS[stage]} {duration(seconds)}" for stage, seconds in self.seconds.items())
+        times = ", ".join(f"{STAGES[stage].planned} {duration(seconds)}" for stage, seconds in self.seconds.items())
         about = f"about {duration(sum(self.seconds.values()))}"
         memory = f"{self.memory_bytes / 1e9:.1f} GB of memory"
         return f"{self.photos} photos, {self.pairs} pairs to match ({self.rule}), {about}: {times}; {memory}"
-
-
-# In the order of the work.
-_WORDS = {
-    "extract": "features",
-    "pair": "pairs",
-    "match": "matches",
-    "map": "poses",
-    "check": "checks",
-    "stabilise": "principal points",
-}
 
 
 def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threads: int) -> Plan:
