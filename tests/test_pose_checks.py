@@ -218,9 +218,12 @@ def estimate(
     settings: PoseSettings = ONE_THREAD,
     *,
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    memory_bytes: int | None = None,
 ) -> tuple[PosesReport, list[str]]:
     notes: list[str] = []
-    report = estimate_poses(photos, scene, settings=settings, notify=notes.append, progress=progress)
+    report = estimate_poses(
+        photos, scene, settings=settings, notify=notes.append, progress=progress, memory_bytes=memory_bytes
+    )
     return report, notes
 
 
@@ -254,9 +257,9 @@ def estimated(photos: Path, mapped: Path, tmp_path_factory: pytest.TempPathFacto
 def test_checks_that_end_the_process_or_never_end_are_left_out(
     photos: Path, mapped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """The worker aborts in the covariance, as C++ may, and sleeps for an hour where half a second is allowed.
+    """The worker aborts in the covariance, as C++ may, sleeps for an hour where half a second is allowed, takes 1 GB.
 
-    The third one, which nothing ends, works in this process.
+    The fourth one, which nothing ends, works in this process.
 
     The photos, which are mapped already, are not mapped again, and the scene says which checks it lacks.
     """
@@ -266,6 +269,7 @@ def test_checks_that_end_the_process_or_never_end_are_left_out(
         "from nerfcli.poses.judge import checks, examine\n"
         "examine.pose_blur_px = lambda *a, **o: os.abort()\n"
         "examine.choose_lenses = lambda *a, **o: time.sleep(3600)\n"
+        "examine.shared_pairs = lambda *a, **o: (b'x' * 10**9, time.sleep(3600))\n"
         "run = checks.Checks.run\n"
         "def bounded(self, name, compute, *, otherwise, seconds=None):\n"
         "    most = 0.5 if name == 'lens models' else seconds\n"
@@ -275,21 +279,27 @@ def test_checks_that_end_the_process_or_never_end_are_left_out(
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
     with worker_in_this_process():
         here = structure_from_motion.run_worker
-    workers = iter([structure_from_motion.run_worker] * 2 + [here])
+    workers = iter([structure_from_motion.run_worker] * 3 + [here])
     monkeypatch.setattr(structure_from_motion, "run_worker", lambda *a, **o: next(workers)(*a, **o))
     stages: list[str] = []
     scene = shutil.copytree(mapped, tmp_path / "scene")
-    report, notes = estimate(photos, scene, progress=lambda stage, done, total: stages.append(f"{stage} {done}"))
+    report, notes = estimate(
+        photos,
+        scene,
+        progress=lambda stage, done, total: stages.append(f"{stage} {done}"),
+        memory_bytes=1_000_000_000,
+    )
     assert report.registered == len(NAMES)
-    assert set(report.not_computed) == {"pose uncertainty", "lens models"}
+    assert set(report.not_computed) == {"pose uncertainty", "lens models", "points of single photos"}
+    assert report.not_computed["points of single photos"].endswith("it needed more than 1 GB of memory")
     assert "SIGABRT" in report.not_computed["pose uncertainty"]
     assert report.not_computed["lens models"] == "it took longer than 0 s"
     assert report.cut_short == ()
     for check in report.not_computed:
         assert sum(f"could not compute a check ({check}): " in note for note in notes) == 2
-    assert stages.count("check 0") == 3
+    assert stages.count("check 0") == 4
     assert not any(stage.startswith(("extract", "match", "map")) for stage in stages)
-    assert notes.count("the photos are already mapped: running the checks") == 3
+    assert notes.count("the photos are already mapped: running the checks") == 4
     assert load_scene(scene).frames
 
 

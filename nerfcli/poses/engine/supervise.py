@@ -23,7 +23,7 @@ _LESS_MEMORY = "use smaller photos (--max-size), fewer features (--quality fast)
 
 
 class WorkerDiedError(UserError):
-    """The worker ended by itself, not at a limit or because the disk was full; or a check took too long.
+    """The worker ended by itself, or at a limit of time or memory; not because the disk was full.
 
     check: the name of the check that it was computing, if any.
     """
@@ -50,8 +50,8 @@ def run_worker(
 
     Raises:
         WorkerDiedError: the worker died; the message has the stage, and the last lines of its log. Or it was stopped
-            because a check exceeded its time limit.
-        UserError: it needed too much memory, or the disk is full.
+            because it needed too much memory, or a check too much time.
+        UserError: the disk is full.
     """
     log = job_path.with_name("worker.log")
     stage = "starting"
@@ -82,10 +82,11 @@ def run_worker(
         overdue = WorkerDiedError(f"it took longer than {duration(guard.check['seconds'])}", _GO_ON)
         overdue.check = guard.check["check"]
         raise overdue
-    if guard.reached is not None:
-        raise _too_large(memory_bytes, stage)
-    free_bytes = shutil.disk_usage(job_path.parent).free
-    error = explain_death(worker.returncode, stage, log.read_text(encoding="utf-8", errors="replace"), free_bytes)
+    if guard.reached == "memory":
+        error = _too_large(memory_bytes, stage)
+    else:
+        free_bytes = shutil.disk_usage(job_path.parent).free
+        error = explain_death(worker.returncode, stage, log.read_text(encoding="utf-8", errors="replace"), free_bytes)
     if isinstance(error, WorkerDiedError) and underway.exists():
         error.check = json.loads(underway.read_text(encoding="utf-8"))["check"]
     raise error
@@ -167,7 +168,7 @@ class _Guard:
 
 def _too_large(memory_bytes: int | None, stage: str) -> UserError:
     assert memory_bytes is not None
-    return UserError(
+    return WorkerDiedError(
         f"structure from motion was stopped while {stage}: it needed more than {memory_bytes / 1e9:.3g} GB of memory",
         f"{_LESS_MEMORY}; {_GO_ON}",
         OUT_OF_MEMORY,
