@@ -213,9 +213,21 @@ def in_two_parts(solved: Solved, tmp_path: Path) -> MappedModels:
     return MappedModels(parts, job_again(solved, tmp_path / "again"), attempts, seconds=1000.0)
 
 
-def test_an_accepted_model_takes_in_the_photos_of_a_smaller_one(solved: Solved, tmp_path: Path):
-    """Synthetic truth: of a right model in two parts, the larger takes in the three photos of the smaller one."""
-    mapped = in_two_parts(solved, tmp_path)
+def test_an_accepted_model_takes_in_the_photos_of_a_smaller_one(
+    solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Synthetic truth: of a right model in two parts, the larger takes in the three photos of the smaller one.
+
+    Photo 7 counts as located from points before and after.
+    """
+    mapped = replace(in_two_parts(solved, tmp_path), located=(7,))
+    examined: list[Sequence[int]] = []
+
+    def noted(*arguments, located: Sequence[int], **options) -> ExaminedModel:
+        examined.append(located)
+        return examine(*arguments, located=located, **options)
+
+    monkeypatch.setattr(remap, "examine", noted)
     for _ in range(2):  # the second time, from what was kept
         notes: list[str] = []
         found = choose_model(mapped, lambda *progress: None, notes.append, checks=Checks)
@@ -227,6 +239,7 @@ def test_an_accepted_model_takes_in_the_photos_of_a_smaller_one(solved: Solved, 
             "3 photos in smaller models, next: from the accepted model (about 5 min)",
             "from the accepted model: 10 of 10 photos registered, accepted",
         ]
+    assert examined == [(7,)] * 4
 
 
 def test_an_accepted_model_grows_with_the_lens_that_was_chosen_for_it(solved: Solved, tmp_path: Path):
@@ -382,7 +395,7 @@ def test_a_run_of_the_mapper_ends_if_no_photo_follows(solved: Solved, tmp_path: 
 
     notes: list[str] = []
     mapped = map_with_fallbacks(job_again(solved, tmp_path / "again"), report, notes.append)
-    stopped = "default thresholds: stopped after 0 s without another photo"
+    stopped = "default thresholds: stopped after 0 s without another photo; only its largest snapshot is kept"
     assert (mapped.attempts[0]["models"], mapped.cut_short[0], notes[0]) == ([8], stopped, f"cut short: {stopped}")
 
 
@@ -752,6 +765,33 @@ def test_single_photos_are_located_before_costlier_attempts(solved: Solved, monk
     assert len(tried[8]) > 3
     assert tried[8][:2] == tried[10]
     assert tried[8].count(one_by_one) == 1  # not again from the same points
+
+
+def test_a_model_that_grows_knows_the_photos_that_its_points_placed(solved: Solved, monkeypatch: pytest.MonkeyPatch):
+    """Photo 8 was located before, photo 9 now; then the mapper adds photo 10, and loses photo 8."""
+    tried = attempts.MappingAttempts(solved.job, lambda *progress: None, lambda note: None)
+    tried.take("first", [without(solved.model, (9, 10), tear_down=False)], solved.job, located=(8,))
+    found = without(solved.model, (10,), tear_down=False), [LocationAttempt(9), LocationAttempt(10, refused="why")]
+    monkeypatch.setattr(attempts, "locate_photos", lambda model, job, **options: found)
+    attempts.locate_single_photos(tried)
+    monkeypatch.setattr(attempts, "map_photos", lambda *arguments, **options: [solved.model])
+    tried.extend("lower angles", attempts.LOW_ANGLES)
+    assert (tried.best.models, tried.best.located) == ([solved.model], (8, 9))
+    left = examine([without(solved.model, (8,))], solved.job, lambda *progress: None, located=tried.best.located)
+    assert left.details["not_computed"] == {}
+
+
+def test_a_copy_of_the_database_is_removed_whatever_happens(solved: Solved, tmp_path: Path):
+    job = job_again(solved, tmp_path / "again")
+
+    def interrupted() -> None:
+        with remap._copied(job) as copy:
+            copy.database.with_name("remapped.db-wal").write_bytes(b"a log")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert not list(Path(job.folder).glob("remapped.db*"))
 
 
 def test_pairs_of_perspective_photos_ask_for_no_fisheye(solved: Solved):

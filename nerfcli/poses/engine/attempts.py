@@ -63,7 +63,7 @@ def map_with_fallbacks(job: Job, report: Report, tell: Tell = lambda text: None)
     given = estimate_focal_lengths(job, tell)
     attempts = MappingAttempts(given, report, tell)
     attempts.map("default thresholds", MapperOptions())
-    if attempts.leave_out_photos() and _only_turns(given):
+    if attempts.too_many_left_out() and _only_turns(given):
         attempts.tell_results()
         tell("not trying anything else: the camera turned on the spot")
         return attempts.result()
@@ -101,7 +101,7 @@ class MappingAttempts:
         """Return the best model's number of photos over `candidates`, by default those with enough features."""
         return _placed(self.best.models) / max(self._with_features if candidates is None else candidates, 1)
 
-    def leave_out_photos(self) -> bool:
+    def too_many_left_out(self) -> bool:
         """Return whether too many of the photos with enough features are left out."""
         return self.placed_fraction() < _GOOD_FRACTION
 
@@ -112,7 +112,7 @@ class MappingAttempts:
 
     def may_have_a_fisheye(self) -> bool:
         """Return whether photos are left out, or a field of view came out so wide that the lens may be a fisheye."""
-        return self.leave_out_photos() or any(
+        return self.too_many_left_out() or any(
             field_of_view_deg(model.camera(camera_id)) > FISHEYE_FROM_DEG
             for model in self.best.models[:1]
             for camera_id in set(lenses_of(model).values())
@@ -195,7 +195,7 @@ class MappingAttempts:
         self.announce(what)
         grown = self._run_mapper(what, job, start, base=models[0])
         if grown:
-            self.take(what, [grown[0], *models[1:]], job)
+            self.take(what, [grown[0], *models[1:]], job, located=self.best.located)
 
     def match(self, job: Job, pairs: Sequence[tuple[int, int]]) -> None:
         """Match pairs of photos, and remember if that was cut short."""
@@ -208,11 +208,16 @@ class MappingAttempts:
         register_photos(job)
         self.match(job, job.pairs)
 
-    def take(self, what: str, models: list[pycolmap.Reconstruction], job: Job) -> None:
-        """Record the result of an attempt; it is the best so far if it places more photos."""
+    def take(
+        self, what: str, models: list[pycolmap.Reconstruction], job: Job, *, located: tuple[int, ...] = ()
+    ) -> None:
+        """Record the result of an attempt; it is the best so far if it places more photos.
+
+        `located` are photos that the first model may have from its points, see `MappedModels`.
+        """
         self.record.append({"what": what, "models": [model.num_reg_images() for model in models]})
         if _placed(models) > _placed(self.best.models):
-            self.best = MappedModels(models, job, self.record)
+            self.best = MappedModels(models, job, self.record, located)
 
     def result(self) -> MappedModels:
         """Return the best models with the record of all attempts."""
@@ -222,7 +227,9 @@ class MappingAttempts:
         self, what: str, job: Job, start: MapperOptions, *, base: pycolmap.Reconstruction | None = None
     ) -> list[pycolmap.Reconstruction]:
         def cut(seconds: float) -> None:
-            self._cut(f"{what}: stopped after {duration(seconds)} without another photo")
+            self._cut(
+                f"{what}: stopped after {duration(seconds)} without another photo; only its largest snapshot is kept"
+            )
 
         return map_photos(job, self.report, attempt=len(self.record), start=start, base=base, stalled=cut)
 
@@ -299,7 +306,7 @@ def map_with_more_features(attempts: MappingAttempts) -> None:
     longest = max(max(group.width, group.height) for group in job.groups)
     more = replace(job, variant="full-size", max_features=QUALITIES["best"][1], pairs=all_pairs(len(job.files)))
     so_far = _search_seconds(job)
-    matching = _search_seconds(replace(more, max_image_size=0))
+    matching = matching_seconds(len(more.pairs), max_features=more.max_features)
     full = _search_seconds(replace(more, max_image_size=FULL_SIZE)) - matching
     allowed = _MOST_FOR_MORE * (1 - attempts.placed_fraction()) * so_far - matching
     fraction = min(1.0, max(allowed, 0.0) / full) ** 0.5  # of the longer side: time is proportional to area
@@ -316,11 +323,11 @@ def map_with_more_features(attempts: MappingAttempts) -> None:
 
 # What follows the first attempt, in this order: each if its reason holds, and time is left.
 FALLBACKS: tuple[tuple[Callable[[MappingAttempts], bool], Callable[[MappingAttempts], None]], ...] = (
-    (lambda a: a.leave_out_photos() and a.photos <= ALL_ALIKE_UP_TO, match_remaining_pairs),
+    (lambda a: a.too_many_left_out() and a.photos <= ALL_ALIKE_UP_TO, match_remaining_pairs),
     (lambda a: a.placed_fraction() < 0.5 and _without_exif(a.job) != a.job, map_without_exif),
     (MappingAttempts.may_have_a_fisheye, map_from_fisheye),
     (lambda a: a.connected_fraction() < _GOOD_FRACTION, map_from_other_starts),
-    (lambda a: a.leave_out_photos() and a.photos <= _MOST_FOR_ALL and a.have_unmatched_pairs(), map_with_all_pairs),
+    (lambda a: a.too_many_left_out() and a.photos <= _MOST_FOR_ALL and a.have_unmatched_pairs(), map_with_all_pairs),
     (
         lambda a: a.placed_fraction() < _FEW_FRACTION and a.photos <= _MOST_FOR_ALL and a.can_have_more_features(),
         map_with_more_features,
@@ -340,10 +347,8 @@ def locate_single_photos(attempts: MappingAttempts) -> None:
     placed = tuple(one.image_id for one in located if not one.refused)
     names = dict(zip(job.image_ids, job.names, strict=True))
     rest = [model for model in models[1:] if not set(model.reg_image_ids()) <= set(grown.reg_image_ids())]
-    attempts.take(what, [grown, *rest], job)
+    attempts.take(what, [grown, *rest], job, located=(*attempts.best.located, *placed))
     attempts.record[-1]["photos"] = [{"name": names[one.image_id], **asdict(one)} for one in located]
-    if placed:
-        attempts.best = replace(attempts.best, located=placed)
     attempts.located_from = attempts.best.models
 
 

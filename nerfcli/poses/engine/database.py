@@ -124,8 +124,13 @@ def discard_if_damaged(path: Path) -> None:
     except sqlite3.DatabaseError:
         whole = False
     if not whole:
-        for part in path.parent.glob(path.name + "*"):
-            part.unlink()
+        remove_database(path)
+
+
+def remove_database(path: Path) -> None:
+    """Remove a database, if it exists, with the logs that SQLite keeps beside it."""
+    for part in path.parent.glob(path.name + "*"):
+        part.unlink()
 
 
 def name_images(job: Job) -> None:

@@ -70,7 +70,8 @@ def map_photos(
     many photos, the next one goes on from the largest of them.
 
     Args:
-        stalled: called with a number of seconds if the mapper was ended because it placed no photo for so long.
+        stalled: called with a number of seconds if the mapper was ended because it placed no photo for so long. Then
+            only the largest snapshot is left: pycolmap gives none of its models, not even finished ones.
     """
     output = Path(job.folder) / f"{job.variant}models_{attempt}"
     base_folder = output.with_name(f"{output.name}_base")
@@ -111,7 +112,7 @@ def mapper_limit_seconds(photos: int) -> int:
 
 
 def stall_seconds(photos: int) -> float:
-    """Return the time without another photo after which a run of the mapper ends with those placed so far."""
+    """Return the time without another photo after which a run of the mapper ends with its largest snapshot."""
     return max(mapping_seconds(photos), LEAST_LIMIT_SECONDS)
 
 
@@ -241,8 +242,9 @@ class MappedModels:
     """The mapped models, largest first, and the job whose features and matches they use.
 
     attempts: in order, {"what", "models": sizes, largest first}; the one that locates single photos also has "photos":
-    the result for each. located: ids of images located from the model's points, without a pair that supports them.
-    seconds: spent on mapping. cut_short: what was stopped because it took far longer than planned.
+    the result for each. located: ids of images located from points of the first model, without a pair that supports
+    them; it may have lost some since. seconds: spent on mapping. cut_short: what was stopped because it took far longer
+    than planned.
     """
 
     models: list[pycolmap.Reconstruction]

@@ -16,7 +16,7 @@ import pycolmap
 from nerfcli.errors import duration, several
 from nerfcli.matching.graph import consistent_groups
 from nerfcli.poses.engine.attempts import SMALLER_BASELINE
-from nerfcli.poses.engine.database import keep_geometries
+from nerfcli.poses.engine.database import keep_geometries, remove_database
 from nerfcli.poses.engine.mapping import MappedModels, MapperOptions, map_globally, map_photos, mapper_limit_seconds
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import FOLLOWERS, capture_order
@@ -187,7 +187,7 @@ def _attempt(
         nothing = runner.not_computed.get(what, "nothing to map")
         tell(f"{what}: {'no further photo registered' if models else nothing}")
         return None
-    examined = examine(models[:1], mapped.job, report, checks=runner)
+    examined = examine(models[:1], mapped.job, report, located=mapped.located, checks=runner)
     size = 0 if examined.model is None else examined.model.num_reg_images()
     verdict = "accepted" if examined.verdict.accepted else examined.verdict.failures[0].kind
     tell(f"{what}: {size} of {len(mapped.job.files)} photos registered, {verdict}")
@@ -251,14 +251,18 @@ def _copied(
 ) -> Iterator[Job]:
     """Give the job of a copy of the database, without some pairs and with the cameras of a model.
 
-    The mapper can only extend a model with the same lenses.
+    The mapper can only extend a model with the same lenses. Of an earlier copy, nothing may be left: SQLite would apply
+    its write-ahead log to this one.
     """
     kept = tuple(pair for pair in job.pairs if frozenset(pair) not in without)
     copy = replace(job, variant="remapped", pairs=kept)
+    remove_database(copy.database)
     shutil.copyfile(job.database, copy.database)
-    keep_geometries(copy, kept)
-    with pycolmap.Database.open(copy.database) as database:
-        for camera in () if cameras is None else cameras.cameras.values():
-            database.update_camera(camera)
-    yield copy
-    copy.database.unlink()
+    try:
+        keep_geometries(copy, kept)
+        with pycolmap.Database.open(copy.database) as database:
+            for camera in () if cameras is None else cameras.cameras.values():
+                database.update_camera(camera)
+        yield copy
+    finally:
+        remove_database(copy.database)

@@ -64,8 +64,8 @@ def examine(
 
     A check that cannot be computed is left out and listed in `details["not_computed"]`; the others go on.
 
-    `report` is called with ("check", done, total); `located` are ids of images that are supported by points of the
-    model instead of a pair.
+    `report` is called with ("check", done, total); `located` are ids of images that, where the model places them, are
+    supported by its points instead of a pair.
     """
     checks = Checks() if checks is None else checks
     pairs = read_verified_pairs(job.database, min_matches=MIN_MATCHES)
@@ -78,8 +78,9 @@ def examine(
     names = dict(zip(job.files, job.names, strict=True))
     report("check", 0, 4)
     mapped = without_photos(models[0])
+    single = [photo for photo in located if mapped.exists_image(photo)]
     held: list[VerifiedPair] = checks.run(
-        "points of single photos", lambda: shared_pairs(mapped, located, min_matches=MIN_MATCHES), otherwise=[]
+        "points of single photos", lambda: shared_pairs(mapped, single, min_matches=MIN_MATCHES), otherwise=[]
     )
     model, left_out = checks.run(
         "contradicting photos", lambda: leave_out_contradicting(mapped, [*pairs, *held]), otherwise=(mapped, {})
