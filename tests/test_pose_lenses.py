@@ -4,12 +4,12 @@ import numpy as np
 import pycolmap
 import pytest
 import synthetic_captures as synthetic
-from synthetic_captures import WIDE, Lens
+from synthetic_captures import LONG, WIDE, Lens
 
 from nerfcli.cameras.alignment import align
 from nerfcli.poses.input.job import Solver
 from nerfcli.poses.judge.examine import pose_blur_px
-from nerfcli.poses.model import held_out
+from nerfcli.poses.model import held_out, intrinsics
 from nerfcli.poses.model.intrinsics import choose_lenses, convert_camera
 
 
@@ -126,6 +126,13 @@ def test_intrinsics_that_are_given_stay():
     lenses = choose_lenses(noisy, solver=Solver(fixed=(1,)))
     assert camera_of(lenses.model).params.tolist() == [1300.0, 512.0, 384.0, 0.04]
     assert lenses.candidates == []
+
+
+def test_the_lenses_with_the_most_photos_are_examined_and_reported(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(intrinsics, "MOST_CAMERAS", 1)
+    views = synthetic.ring(9, [WIDE, LONG, LONG], seed=1)
+    lenses = choose_lenses(synthetic.observed_model(views, synthetic.boulder(300, seed=2), noise_px=0.5, seed=0))
+    assert {candidate.camera for candidate in lenses.candidates} == set(lenses.uncertainty) == {2}
 
 
 def test_a_named_model_stays():

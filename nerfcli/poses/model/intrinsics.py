@@ -42,7 +42,7 @@ DEVIATIONS = 3.0
 # The gain must be this fraction of the error; a smaller one changes no picture.
 _GAIN_FRACTION = 0.001
 # Each lens costs some adjustments; beyond this many lenses, and for those with fewer photos, the simplest model stays.
-# The report has the uncertainty of as many.
+# The report has the uncertainty of as many, those with the most photos.
 MOST_CAMERAS = 8
 LEAST_PHOTOS = 3
 # Relative changes of the cost at which adjustments end: smaller ones take two to four times as long and move cameras by
@@ -81,9 +81,7 @@ def choose_lenses(
         exif_focal_px: by camera id, the focal length to keep if the observations do not determine it.
     """
     photos = Counter(lenses_of(model).values())
-    cameras = sorted(
-        (c for c in photos if c not in solver.fixed and photos[c] >= LEAST_PHOTOS), key=lambda c: -photos[c]
-    )
+    cameras = [c for c, count in photos.most_common() if c not in solver.fixed and count >= LEAST_PHOTOS]
     candidates: list[Candidate] = []
     freed: list[int] = []
     held: dict[int, DeterminedLens] = {}
@@ -133,7 +131,7 @@ def choose_lenses(
         camera_id: uncertainty(
             result, camera_id, solver, principal_point=camera_id in freed and camera_id not in strayed
         )
-        for camera_id in sorted(photos)[:MOST_CAMERAS]
+        for camera_id, _ in photos.most_common(MOST_CAMERAS)
     }
     return ModelLenses(result, candidates, certain)
 

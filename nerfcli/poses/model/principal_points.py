@@ -6,6 +6,7 @@ from the centre, no pose can describe: for a shift of one degree in a picture of
 these are 5 pixels at the border.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -170,7 +171,7 @@ def _settled(
     of_photos = OwnCameras(lens_of, free - held)
     certain = {
         lens: uncertainty(own, lens, solver, principal_point=False, own=of_photos)
-        for lens in sorted(set(lens_of.values()))[:MOST_CAMERAS]
+        for lens, _ in Counter(lens_of.values()).most_common(MOST_CAMERAS)
     }
     return StabilisedModel(own, evidence, certain)
 
