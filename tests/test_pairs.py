@@ -180,8 +180,12 @@ def shared_descriptors(photos: int, *, seed: int = 0) -> tuple[list[np.ndarray],
 
 
 def test_likeness_counts_the_features_that_two_photos_share():
-    """Synthetic truth; random descriptors are far from each other, so no match is wrong and none is missed."""
+    """Synthetic truth; random descriptors are far from each other, so no match is wrong and none is missed.
+
+    One photo has a feature more than the others, so that these have a row of padding each.
+    """
     descriptors, truth = shared_descriptors(70)  # more than a block
+    descriptors[9] = np.vstack([descriptors[9], np.random.default_rng(1).integers(0, 256, (1, 128))])
     descriptors[5] = descriptors[5][:0]
     truth[5] = truth[:, 5] = 0
     np.testing.assert_array_equal(likeness(descriptors, lambda *reported: None), truth)

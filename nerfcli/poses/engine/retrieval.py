@@ -22,11 +22,14 @@ from nerfcli.poses.input.pairs import in_blocks, retrieval_feature_count
 _RATIO = 0.64
 # Pairs with fewer common features than this are left out, except this many, the best, of each photo.
 _FEW = 4
-# Two photos that both have this many pairs with so many common features are not matched with each other for fewer: a
-# third of the pairs of an orbit is left out, half of those of a plain object, with 3 to 7 % of the verified matches.
+# Two photos that both have this many pairs with so many common features are not matched with each other for fewer: this
+# leaves out a third of the pairs of an orbit and half of those of a plain object, which hold 3 to 7 % of the verified
+# matches.
 _MANY = 12
 # Change this whenever this module would find other pairs.
-_VERSION = "256 coarsest, ties kept, pairs without common features left out, or with few where there are many"
+_VERSION = (
+    "256 coarsest, ties kept, no padding, pairs without common features left out, or with few where there are many"
+)
 
 
 def select_pairs(job: Job, report: Report) -> Job:
@@ -56,11 +59,13 @@ def likeness(descriptors: Sequence[np.ndarray], report: Report) -> np.ndarray:
     """
     count = len(descriptors)
     most = max((len(rows) for rows in descriptors), default=0)
-    # Photos with fewer features are padded with zeros, which are never a clear nearest neighbour.
+    # Photos with fewer features are padded with rows that are infinitely far from all others.
     padded = np.zeros((count, max(most, 2), 128), np.float32)
     for photo, rows in enumerate(descriptors):
         padded[photo, : len(rows)] = rows
     sizes = (padded**2).sum(axis=2)
+    for photo, rows in enumerate(descriptors):
+        sizes[photo, len(rows) :] = np.inf
     shared = np.zeros((count, count), np.int64)
     block = 64  # other photos compared at a time: some tens of megabytes
     for i in range(count):
