@@ -7,7 +7,7 @@ aligns many of these pairs joins the models.
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -142,11 +142,12 @@ def align(first: pycolmap.Reconstruction, common: CommonPoints, *, seed: int) ->
         return None
     rng = np.random.default_rng(seed)
     best = np.zeros(count, dtype=bool)
+    rows_of = {int(photo): np.flatnonzero(common.photos == photo) for photo in np.unique(common.photos)}
     for _ in range(500):
         sample = rng.choice(count, 3, replace=False)
         if not np.ptp(common.second[sample], axis=0).any():  # one point, seen in three photos
             continue
-        fits = _fits(first, common, similarity(common.second[sample], common.first[sample]))
+        fits = _fits(first, common, rows_of, similarity(common.second[sample], common.first[sample]))
         if fits.sum() > best.sum():
             best = fits
     if best.sum() < MIN_MATCHES:
@@ -155,12 +156,16 @@ def align(first: pycolmap.Reconstruction, common: CommonPoints, *, seed: int) ->
     return pycolmap.Sim3d(found.scale, pycolmap.Rotation3d(found.rotation), found.translation)
 
 
-def _fits(first: pycolmap.Reconstruction, common: CommonPoints, first_from_second: Similarity) -> NDArray[np.bool_]:
+def _fits(
+    first: pycolmap.Reconstruction,
+    common: CommonPoints,
+    rows_of: Mapping[int, NDArray[np.int64]],
+    first_from_second: Similarity,
+) -> NDArray[np.bool_]:
     moved = first_from_second.apply(common.second)
     fits = np.zeros(len(moved), dtype=bool)
-    for photo in np.unique(common.photos):
-        rows = np.flatnonzero(common.photos == photo)
-        image = first.image(int(photo))
+    for photo, rows in rows_of.items():
+        image = first.image(photo)
         pose = image.cam_from_world()
         local = moved[rows] @ pose.rotation.matrix().T + pose.translation
         camera = first.camera(image.camera_id)
@@ -189,7 +194,7 @@ def _join(
             moved.transform(one.base_from_model)
             owners = dict.fromkeys(moved.reg_image_ids(), number) | owners
             _add(joined, moved, {photo for photo, owner in owners.items() if owner == number})
-        _merge_tracks(joined, cache)
+        _merge_tracks(joined, cache, seed=job.seed)
         held_out.adjust(joined, job.solver, tolerance=_TOLERANCE)
         held_out.drop_misfits(joined)
         agreeing = [
@@ -215,11 +220,11 @@ def _add(joined: pycolmap.Reconstruction, model: pycolmap.Reconstruction, photos
             joined.add_point3D(point.xyz, pycolmap.Track(seen))
 
 
-def _merge_tracks(model: pycolmap.Reconstruction, cache: pycolmap.DatabaseCache) -> None:
+def _merge_tracks(model: pycolmap.Reconstruction, cache: pycolmap.DatabaseCache, *, seed: int) -> None:
     """Join points that matches connect, and add observations to points, in place."""
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(model)
-    mapper.complete_and_merge_tracks(pycolmap.IncrementalTriangulatorOptions())
+    mapper.complete_and_merge_tracks(pycolmap.IncrementalTriangulatorOptions(random_seed=seed))
     mapper.end_reconstruction(discard=False)
 
 
@@ -227,8 +232,9 @@ def _triangulated_again(model: pycolmap.Reconstruction, job: Job, *, output: Pat
     """Return the model with points from all matches, adjusted until it converges."""
     output.mkdir(parents=True, exist_ok=True)
     options = pycolmap.IncrementalPipelineOptions(
-        num_threads=job.threads, extract_colors=False, ba_global_max_refinements=_REFINEMENTS
+        num_threads=job.threads, random_seed=job.seed, extract_colors=False, ba_global_max_refinements=_REFINEMENTS
     )
+    options.mapper.random_seed = options.triangulation.random_seed = job.seed
     model = pycolmap.triangulate_points(
         model,
         job.database,
