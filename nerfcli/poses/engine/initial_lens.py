@@ -17,6 +17,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
+from nerfcli.photos.focal_evidence import usual_focal_px
 from nerfcli.poses.engine.database import register_photos
 from nerfcli.poses.input.job import CameraGroup, Job, Tell
 from nerfcli.poses.model.held_out import MOST_ERROR_PX
@@ -206,7 +207,8 @@ def _fisheye_focal_px(group: CameraGroup, job: Job, database: pycolmap.Database)
     options.ransac.random_seed = job.seed
     options.ransac.max_error = MOST_ERROR_PX
     options.ransac.max_num_trials = 1000
-    camera = pycolmap.Camera.create_from_model_name(1, START_MODEL, 1.2 * group.width, group.width, group.height)
+    usual_px = usual_focal_px(group.width, group.height)
+    camera = pycolmap.Camera.create_from_model_name(1, START_MODEL, usual_px, group.width, group.height)
     freely = sum(_agreeing(pycolmap.estimate_two_view_geometry, camera, pair, options) for pair in pairs)
     longer = max(group.width, group.height)
     found = []

@@ -216,7 +216,7 @@ def _rotation_measure(errors: Sequence[RotationError]) -> dict[str, Any]:
 
 
 def _no_baseline(turn: RotationFit | None, geometry: Mapping[str, Any], held_out_px: float | None) -> list[Failure]:
-    """Return the failure if a rotation explains the matches nearly as well as the model, or the cameras are together.
+    """Return the failure if a rotation explains the matches nearly as well, or if the cameras are all in one place.
 
     Parallax in pixels is also small in small photos and far from the scene, where a model may still be right.
     """

@@ -53,9 +53,8 @@ def best_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[i
     """
     if not pairs:
         return None
-    chosen = pairs[:: -(-len(pairs) // _MOST_PAIRS)]
+    chosen, counts = _selected(pairs)
     longest = max(max(sizes[photo]) for pair in chosen for photo in (pair.one, pair.other))
-    counts = np.array([min(pair.matches, _MOST_MATCHES) for pair in chosen])
     one = _from_middle([(pair.pixels_one, sizes[pair.one]) for pair in chosen], counts)
     other = _from_middle([(pair.pixels_other, sizes[pair.other]) for pair in chosen], counts)
 
@@ -80,16 +79,21 @@ def panorama_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tup
     """Find how well rotations explain the matches between panoramas, whose rays are known, as `best_rotation_fit`."""
     if not pairs:
         return None
-    chosen = pairs[:: -(-len(pairs) // _MOST_PAIRS)]
+    chosen, counts = _selected(pairs)
     photos = {photo for pair in chosen for photo in (pair.one, pair.other)}
     cameras = {photo: panorama_camera(sizes[photo]) for photo in photos}
-    counts = np.array([min(pair.matches, _MOST_MATCHES) for pair in chosen])
     one, other = np.zeros((2, len(chosen), 3, counts.max()))
     for place, (count, pair) in enumerate(zip(counts, chosen, strict=True)):
         one[place, :, :count] = rays(cameras[pair.one], pair.pixels_one[:count]).T
         other[place, :, :count] = rays(cameras[pair.other], pair.pixels_other[:count]).T
     focal_px = max(px_per_radian(camera) for camera in cameras.values())
     return RotationFit(float(np.quantile(_rest(one, other, counts), _QUANTILE) * focal_px), focal_px)
+
+
+def _selected(pairs: Sequence[VerifiedPair]) -> tuple[Sequence[VerifiedPair], NDArray[np.int64]]:
+    """Return an even selection of the pairs, and how many matches of each are used."""
+    chosen = pairs[:: -(-len(pairs) // _MOST_PAIRS)]
+    return chosen, np.array([min(pair.matches, _MOST_MATCHES) for pair in chosen])
 
 
 def _from_middle(photos: Sequence[tuple[Array, tuple[int, int]]], counts: NDArray[np.int64]) -> Array:

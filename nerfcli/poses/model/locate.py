@@ -44,8 +44,8 @@ _LEAST_FOUND = 25
 _BESIDE = [(6.0, 9.0)[i % 2] * np.array([np.cos(i * np.pi / 4), np.sin(i * np.pi / 4)]) for i in range(8)]
 _HERE = np.zeros(2)
 _CLEARLY = 2.5
-# Least fraction of the picture over which the found features must spread. A detail that looks
-# like one that is elsewhere covers less.
+# Least fraction of the picture over which the found features must spread. A detail that merely resembles one elsewhere
+# covers less.
 _LEAST_AREA = 0.05
 # Largest standard deviations of a pose: of its angles, and of its position relative to the distance of its points.
 _MOST_TURN_DEG, _MOST_SHIFT = 0.5, 0.02
