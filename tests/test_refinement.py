@@ -408,6 +408,18 @@ def test_poses_are_damped_less_and_less_and_fixed_once_the_fault_is_found(monkey
     assert holding[2] == pytest.approx(1e-3, rel=0.2)
 
 
+def test_poses_that_float32_has_rounded_stay_rigid(small, monkeypatch):
+    """A rotation in float32 is orthonormal to 6e-8, which 100 steps without motion would raise to 1e-5."""
+    steps_of(monkeypatch, 0.0)
+    frames = small.train_frames
+    poses = Refinement("poses", pool_of(replace(small, frames=(*frames, frames[0]), test_names=frozenset()))).poses
+    assert poses is not None
+    for _ in range(100):
+        poses.step(*NO_RAYS, camera_plan(0.5), rate=1.0)
+    rotations = poses.poses()[:, :3, :3]
+    assert np.abs(np.swapaxes(rotations, -1, -2) @ rotations - np.eye(3)).max() < 1e-9
+
+
 def test_poses_go_by_the_rate_of_the_whole_way(monkeypatch):
     """To first order a tenth of the rate is a tenth of the way."""
     steps_of(monkeypatch, 1e-7)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from nerfcli.cameras.camera import Camera, by_lens
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.lens_change import FOCAL, bearings_by_change, changeable, changed, pixels_by_change
-from nerfcli.cameras.rigid import from_parts, inverse, transform_from_twist, vector_from_rotation
+from nerfcli.cameras.rigid import from_parts, inverse, nearest_rotation, transform_from_twist, vector_from_rotation
 from nerfcli.training.optimiser import Delayed, NewtonSteps, WhitenedAdam, on_device_of, whitening, without_mean
 from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.schedule import CameraPlan
@@ -217,7 +217,9 @@ class Refinement(nn.Module):
     def __init__(self, kind: str, pool: PixelPool, log_focal: float = 0.0):
         super().__init__()
         self._pool = pool
-        self._given = pool.poses.double().cpu().numpy()
+        given = pool.poses.double().cpu().numpy()
+        # Each step would multiply the rotations by the rounding of float32, as `inverse` transposes them.
+        self._given = from_parts(nearest_rotation(given[:, :3, :3]), given[:, :3, 3])
         self.poses = PoseRefinement(self._given, pool.cameras) if kind in ("poses", "all") else None
         names = [(FOCAL,)] if kind == "focal" else [changeable(camera) for camera in pool.cameras if kind == "all"]
         listed = tuple(dict.fromkeys(name for own in names for name in own))
