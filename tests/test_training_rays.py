@@ -123,6 +123,17 @@ def test_the_unit_ball_reaches_what_cameras_see_where_it_is_behind_them():
     assert 1 / contracted_frame(scene_of(ring(), middle + directions))[0].scale == pytest.approx(4.5, rel=1e-9)
 
 
+def test_panoramas_are_as_far_from_all_around_them_as_from_what_is_ahead():
+    """From the middle of a sphere of radius 10, z of half of the points ahead is less than 5."""
+    directions = np.random.default_rng(0).normal(size=(2000, 3))
+    walls = np.array([1.0, 2.0, 3.0]) + 10 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    panorama = Camera("EQUIRECTANGULAR", 64, 32, (64, 32))
+    frames = [replace(frame, camera=panorama) for frame in ring(radius=0.01)]
+    similarity, _, background = narrow_frame(scene_of(frames, walls))
+    assert 1 / similarity.scale == pytest.approx(10, rel=0.01)
+    assert background == pytest.approx(2.5, rel=0.01)
+
+
 def test_a_box_holds_the_points_but_for_stray_ones():
     rng = np.random.default_rng(0)
     points = rng.uniform((-1, 0, 5), (5, 2, 8), (5000, 3))

@@ -177,14 +177,15 @@ def _typical_depths(scene: Capture) -> np.ndarray | None:
         if len(scene.points) == 0:
             break
         in_camera = apply(inverse(frame.world_from_cam), scene.points)
-        in_camera = in_camera[in_camera[:, 2] > 0]
+        depths = np.linalg.norm(in_camera, axis=1) if frame.camera.is_spherical else in_camera[:, 2]
+        in_camera, depths = in_camera[depths > 0], depths[depths > 0]
         if len(in_camera) == 0:
             continue
         pixels, valid = frame.camera.project(in_camera)
         size = np.array([frame.camera.width, frame.camera.height])
-        depth = in_camera[valid & (pixels >= 0).all(1) & (pixels < size).all(1), 2]
-        if len(depth) >= 10:
-            rows.append(np.percentile(depth, [1, 50]))
+        depths = depths[valid & (pixels >= 0).all(1) & (pixels < size).all(1)]
+        if len(depths) >= 10:
+            rows.append(np.percentile(depths, [1, 50]))
     return np.array(rows) if rows else None
 
 
