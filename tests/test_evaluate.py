@@ -18,6 +18,9 @@ from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit, whole_windows
 from nerfcli.evaluate.photos import HeldOutPhoto, over_white
 from nerfcli.evaluate.protocol import evaluate_model
 from nerfcli.field.exposure import exposed
+from nerfcli.photos.loading import LoadedPhoto
+from nerfcli.training.checkpoints import HeldoutPixels
+from nerfcli.training.pool import PixelPool
 
 EVERYTHING = np.ones((24, 32), dtype=bool)
 # A grid without occupied cells: only the background is seen.
@@ -147,16 +150,24 @@ def test_the_gains_of_a_photo_are_applied_to_its_picture():
     assert entry.exposure == {"from": "their mean", "log_gains": [0.1, 0.1, 0.1]}
 
 
-def test_evaluation_of_fog_in_closed_form():
-    # Straight through a cube of side 2 with density 1: opacity 1 - exp(-2) of colour 1/2 on white.
-    model = fog(foggy_cells((-1, -1, -1), (1, 1, 1)), Similarity.identity())
-    seen = 0.5 * (1 - math.exp(-2)) + math.exp(-2)
+@pytest.mark.parametrize("gain", [0.0, -0.7])
+def test_evaluation_of_fog_in_closed_form(gain):
+    """Straight through a cube of side 2 with density 1: opacity 1 - exp(-2) of colour 1/2 on white.
+
+    Gains apply to the fog and not to the white.
+    """
+    model = fog(foggy_cells((-1, -1, -1), (1, 1, 1)), Similarity.identity(), background=(1.0, 1.0, 1.0))
+    shown = float(exposed(torch.tensor(0.5), torch.tensor(gain)))
+    seen = shown * (1 - math.exp(-2)) + math.exp(-2)
     narrow = Frame("a", Camera.pinhole(3, 3, 3000.0), frame("a").world_from_cam)
-    photo = HeldOutPhoto(narrow, np.zeros((3, 3, 4), dtype=np.uint8), None)  # white
+    photo = HeldOutPhoto(narrow, np.zeros((3, 3, 4), dtype=np.uint8), None, log_gains=(gain,) * 3)  # white
     error, unrounded = 1 - round(255 * seen) / 255, 1 - seen
     metrics = evaluate_model(model, [photo], on_image=lambda done, total: None)
     assert metrics.images[0].metrics.psnr == pytest.approx(-20 * math.log10(error))
     assert metrics.images[0].metrics.psnr_float == pytest.approx(-20 * math.log10(unrounded), abs=1e-3)
+    pixels = PixelPool([LoadedPhoto(narrow, photo.pixels, None)], Similarity.identity(), torch.device("cpu"))
+    measured = HeldoutPixels(pixels).psnr(model, log_gains=np.full((1, 3), gain))
+    assert measured == pytest.approx(-20 * math.log10(unrounded), abs=1e-3)
 
 
 def test_masked_pixels_do_not_count():

@@ -21,10 +21,10 @@ from nerfcli.errors import UserError
 from nerfcli.evaluate.billboards import Billboards, reduction
 from nerfcli.evaluate.metrics import to_8_bit
 from nerfcli.field.background import Background
-from nerfcli.field.exposure import exposed
+from nerfcli.field.exposure import changed_in_front, exposed
 from nerfcli.photos.held_out_exposure import gain_sources, log_gains_of
 from nerfcli.photos.images import write_png
-from nerfcli.photos.loading import downscaled_camera, load_photos
+from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photo, load_photos
 from nerfcli.render.pictures import Renderable, RenderedPicture
 from nerfcli.training.runs.run import Run
 
@@ -91,18 +91,29 @@ def paired(photo: HeldOutPhoto, picture: RenderedPicture) -> ComparedImages:
         )
     return ComparedImages(
         photo.frame,
-        as_exposed(picture.rgb, photo.log_gains),
+        as_exposed(photo, picture.rgb, picture.opacity),
         over_white(photo.pixels),
         used,
         photo.pixels.shape[-1] == 4,
     )
 
 
-def as_exposed(rgb: np.ndarray, log_gains: tuple[float, ...]) -> np.ndarray:
-    """Return a picture with a photo's gains applied, clipped; unchanged if all gains are 1."""
-    if not any(log_gains):
+def as_exposed(photo: HeldOutPhoto, rgb: np.ndarray, opacity: np.ndarray) -> np.ndarray:
+    """Return colours (..., 3) with a photo's gains applied, clipped; unchanged if all gains are 1.
+
+    Args:
+        rgb: on the background of the photo's picture; gains do not apply to the white behind a photo with alpha.
+        opacity: (...,).
+    """
+    if not any(photo.log_gains):
         return rgb
-    return exposed(torch.from_numpy(rgb), torch.tensor(log_gains)).clamp(0.0, 1.0).numpy()
+    colours, log_gains = torch.from_numpy(rgb), torch.tensor(photo.log_gains)
+    if photo.pixels.shape[-1] == 4:
+        passing = 1.0 - torch.from_numpy(opacity)[..., None]
+        shown = changed_in_front(colours, lambda own: exposed(own, log_gains), transmittance=passing, behind=1.0)
+    else:
+        shown = exposed(colours, log_gains)
+    return shown.clamp(0.0, 1.0).numpy()
 
 
 def held_out_photos(run: Run, frames: Sequence[Frame]) -> list[HeldOutPhoto]:

@@ -1,6 +1,6 @@
 """Evaluation on random pixels of held-out photos: a cheap estimate of `evaluate` on whole photos."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,40 +54,44 @@ class SampledPixels:
     @torch.no_grad()
     def psnr(self, model: Model) -> float:
         """Return the mean over photos of the PSNR on their pixels, in dB, 8 bit, to estimate the mean of `evaluate`."""
-        values = []
-        for photo, pixels in zip(self.photos, self.pixels, strict=True):
-            rgb, valid = _render_sampled(model, photo, pixels)
-            truth = over_white(photo.pixels).reshape(-1, 3)[pixels]
-            if valid.any():
-                values.append(compare(as_exposed(rgb, photo.log_gains), truth, used=valid).psnr)
-        return float(np.mean(values))
+        return self._psnr(lambda photo, pixels: _render_sampled(model, photo, pixels))
 
     def psnr_of_pictures(self, model: Renderable) -> float:
         """Return the same of a model whose whole pictures take less time than these pixels of a field."""
+
+        def render(photo: HeldOutPhoto, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            picture = model.render(photo.frame, background=background_of(model, photo))
+            return picture.rgb.reshape(-1, 3)[pixels], picture.opacity.ravel()[pixels], picture.valid.ravel()[pixels]
+
+        return self._psnr(render)
+
+    def _psnr(self, render: Callable[[HeldOutPhoto, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]) -> float:
+        """Return the mean PSNR of what a function renders: see `_render_sampled`."""
         values = []
         for photo, pixels in zip(self.photos, self.pixels, strict=True):
-            picture = model.render(photo.frame, background=background_of(model, photo))
-            rgb, valid = picture.rgb.reshape(-1, 3)[pixels], picture.valid.ravel()[pixels]
+            rgb, opacity, valid = render(photo, pixels)
             truth = over_white(photo.pixels).reshape(-1, 3)[pixels]
             if valid.any():
-                values.append(compare(as_exposed(rgb, photo.log_gains), truth, used=valid).psnr)
+                values.append(compare(as_exposed(photo, rgb, opacity), truth, used=valid).psnr)
         return float(np.mean(values))
 
 
-def _render_sampled(model: Model, photo: HeldOutPhoto, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return colours (N, 3) in [0, 1] at pixel centres, in the field's precision, and which of them have a ray."""
+def _render_sampled(model: Model, photo: HeldOutPhoto, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return colours (N, 3) in [0, 1] at pixel centres, in the field's precision, opacities, and which have a ray."""
     dtype = next(model.field.parameters()).dtype
     rays = pixel_rays(photo.frame, model.training_from_scene, pixels=pixels, device=model.device)
     directions, origin = rays.directions.to(dtype), rays.origin.to(dtype)
     behind = colours_behind(background_of(model, photo), directions)
-    colours = [
+    seen = (
         render_rays(
             model,
             origin.expand_as(some),
             some,
             background=behind[begin : begin + len(some)],
             cones=rays.cones[begin : begin + len(some)].to(dtype),
-        ).rgb
+            keep_intervals=False,
+        )
         for begin, some in zip(range(0, len(directions), _RAYS), directions.split(_RAYS), strict=True)
-    ]
-    return torch.cat(colours).clamp(0.0, 1.0).cpu().numpy(), rays.valid.cpu().numpy()
+    )
+    rgb, opacity = map(torch.cat, zip(*((one.rgb, one.ends.opacity) for one in seen), strict=True))
+    return rgb.clamp(0.0, 1.0).cpu().numpy(), opacity.cpu().numpy(), rays.valid.cpu().numpy()

@@ -4,8 +4,13 @@ The field holds the colours at mean exposure; a photo shows them multiplied by i
 have mean 0 over the photos: what all photos have in common is left to the field, and rendered pictures need no gains.
 """
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
+
+# A ray with less opacity has no meaningful colour of its own.
+LEAST_OPACITY = 1e-3
 
 
 def linear_from_srgb(levels: Tensor) -> Tensor:
@@ -35,6 +40,20 @@ def exposed(rgb: Tensor, log_gains: Tensor) -> Tensor:
     Differentiable in both.
     """
     return srgb_from_linear(linear_from_srgb(rgb) * log_gains.exp())
+
+
+def changed_in_front(
+    rgb: Tensor, change: Callable[[Tensor], Tensor], *, transmittance: Tensor, behind: Tensor | float
+) -> Tensor:
+    """Return sRGB colours (..., 3) on a background with a change, such as `exposed`, to what is in front of it alone.
+
+    Args:
+        rgb: composited on `behind`.
+        transmittance: (..., 1) fraction of the light from behind.
+    """
+    opacity, passing = 1.0 - transmittance, transmittance * behind
+    own = (rgb - passing).clamp_min(0.0) / opacity.clamp_min(LEAST_OPACITY)
+    return opacity * change(own) + passing
 
 
 class Exposure(nn.Module):

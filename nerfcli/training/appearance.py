@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from nerfcli.errors import UserError
 from nerfcli.field.background import SphereBackground
-from nerfcli.field.exposure import Exposure
+from nerfcli.field.exposure import Exposure, changed_in_front
 from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.refinement import Refinement
 from nerfcli.training.runs.components import LEARNED_BACKGROUNDS, Components
@@ -14,8 +14,6 @@ from nerfcli.training.runs.components import LEARNED_BACKGROUNDS, Components
 BACKGROUND_RATE, EXPOSURE_RATE = 5.0, 2.0
 # At or above this level, a photo tells only that the light was at least that bright.
 SATURATED = 254.5 / 255
-# A ray with less opacity has no meaningful colour of its own.
-LEAST_OPACITY = 1e-3
 # Initial background levels are kept this far from 0 and 1, which a sigmoid does not reach.
 LEAST_LEVEL = 0.02
 
@@ -120,14 +118,14 @@ class Appearance(nn.Module):
         measured = over_background(drawn.colours, behind)
         if self.exposure is None:
             return rendered, measured
-        photos = self._pool.photo_of(drawn.numbers)
+        exposure, photos = self.exposure, self._pool.photo_of(drawn.numbers)
+
+        def shown(colours: Tensor) -> Tensor:
+            return _up_to_white(exposure(colours, photos), drawn.colours)
+
         if not self._pool.has_alpha:
-            return _up_to_white(self.exposure(rendered, photos), drawn.colours), measured
-        # Exposures apply to the object only, not to the colour that was put behind it.
-        opacity = 1.0 - transmittance[:, None]
-        own = (rendered - transmittance[:, None] * behind).clamp_min(0.0) / opacity.clamp_min(LEAST_OPACITY)
-        own = _up_to_white(self.exposure(own, photos), drawn.colours)
-        return opacity * own + transmittance[:, None] * behind, measured
+            return shown(rendered), measured
+        return changed_in_front(rendered, shown, transmittance=transmittance[:, None], behind=behind), measured
 
 
 def over_background(colours: Tensor, background: Tensor) -> Tensor:

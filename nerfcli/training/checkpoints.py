@@ -23,7 +23,7 @@ from nerfcli.captures.formats.run_cameras import CAMERAS, write_cameras
 from nerfcli.errors import UserError
 from nerfcli.field.background import colours_behind
 from nerfcli.field.checkpoint import load_tensors, refuse_non_finite, save_tensors
-from nerfcli.field.exposure import exposed
+from nerfcli.field.exposure import changed_in_front, exposed
 from nerfcli.field.hash_field import HashField
 from nerfcli.field.kinds import settings_from_json
 from nerfcli.photos.colours import psnr_of
@@ -297,12 +297,17 @@ class HeldoutPixels:
             *(rays.split(512) for rays in (self.origins, self.directions, self.cones, background)),
             strict=True,
         )
-        rendered = torch.cat(
-            [render_rays(model, *rays, background=behind, cones=cones).rgb for *rays, cones, behind in parts]
-        )
+        seen = (render_rays(model, *rays, background=behind, cones=cones) for *rays, cones, behind in parts)
+        columns = zip(*((one.rgb, 1.0 - one.ends.opacity[:, None]) for one in seen), strict=True)
+        rendered, transmittance = map(torch.cat, columns)
         wanted = over_background(self.colours, background)
         if log_gains.any():
-            rendered = exposed(rendered, torch.as_tensor(log_gains).to(rendered)[self.photos])
+            gains = torch.as_tensor(log_gains).to(rendered)[self.photos]
+            if self.colours.shape[-1] == 3:  # the background is a part of the photo
+                transmittance = torch.zeros_like(transmittance)
+            rendered = changed_in_front(
+                rendered, lambda own: exposed(own, gains), transmittance=transmittance, behind=background
+            )
         error = (rendered.clamp(0.0, 1.0) - wanted).square().mean().item()
         return psnr_of(error)
 
