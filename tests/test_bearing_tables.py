@@ -95,3 +95,29 @@ def test_the_memory_of_stabilised_photos_counts_their_bearings_once():
     settings = TrainSettings(budget_seconds=None, steps=7)
     own, one = ([replace(ring()[0], camera=camera) for camera in cameras] for cameras in (stabilised(LENS), [LENS] * 7))
     assert needs_of(own, 1, settings=settings).photos == needs_of(one, 1, settings=settings).photos
+
+
+def test_trials_need_a_list_of_pixels_and_occluders_another_one():
+    """Eight bytes of a number and one of a mask; two masks for occluders, which users may turn off."""
+    chosen = TrainSettings(budget_seconds=None, steps=7)
+    photos = [
+        needs_of(ring(), 1, settings=settings).photos
+        for settings in (
+            chosen,
+            replace(chosen, model="auto", fixed=("occluders",)),
+            replace(chosen, model="auto"),
+        )
+    ]
+    pixels = sum(frame.camera.width * frame.camera.height for frame in ring())
+    assert np.diff(photos).tolist() == [9 * pixels, 10 * pixels]
+
+
+def test_a_step_of_a_network_needs_its_neurons():
+    """Of each sample all activations and their gradients, float32: a layer has 1 / 3.5 of the weights."""
+    small, large = (
+        needs_of(ring(), 1, settings=TrainSettings(field="mlp", field_memory_bytes=size)).step
+        for size in (2**18, 2**26)
+    )
+    width = (2**26 / 4 / 3.5) ** 0.5
+    more = 7 * (2**26 - 2**18) + TrainSettings().samples_per_step * 4 * 2 * 4 * width * (1 - 1 / 16)
+    assert large - small == pytest.approx(more, rel=0.1)

@@ -19,7 +19,7 @@ from nerfcli.training import loop
 from nerfcli.training.loop import train
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import SHOWN, THRESHOLD
-from nerfcli.training.storage import field_bytes
+from nerfcli.training.storage import planned_field
 from nerfcli.workflows.train import plan_training
 
 STEPS = TrainSettings(budget_seconds=None, steps=250)
@@ -45,8 +45,8 @@ def test_disk_space_covers_a_run_its_waypoints_and_the_state_that_is_replaced(
 def test_the_size_of_a_field_is_that_which_it_gets(kind: str) -> None:
     rows = 16
     size = chosen_size(kind, hash_grid=HashFieldSettings("l2", log2_rows=rows), footprint=1e-4, memory_bytes=None)
-    planned = field_bytes(replace(STEPS, field=kind, log2_rows=rows))
-    assert planned == pytest.approx(parameter_bytes(size), rel=0.15)  # sizes are whole levels
+    planned = planned_field(replace(STEPS, field=kind, log2_rows=rows))
+    assert parameter_bytes(planned) == pytest.approx(parameter_bytes(size), rel=0.15)  # sizes are whole levels
 
 
 def test_photos_that_memory_cannot_hold_are_on_the_disk() -> None:
@@ -63,7 +63,7 @@ def test_photos_that_memory_cannot_hold_are_on_the_disk() -> None:
 
 def test_twice_the_rows_take_twice_the_field() -> None:
     small, large = (plan_training(SPHERES, replace(STEPS, log2_rows=rows)) for rows in (18, 19))
-    assert large.disk_bytes == 2 * small.disk_bytes
+    assert large.disk_bytes == pytest.approx(2 * small.disk_bytes, rel=1e-3)  # besides the networks
 
 
 def test_dry_run_prints_the_plan_and_writes_nothing(capture: Path) -> None:

@@ -432,6 +432,19 @@ def test_pages_are_given_back_beyond_the_limit(tmp_path):
     assert [int(array[part * 2**22 + 7]) for part in range(16)] == list(range(16))
 
 
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="only Linux lists what is mapped")
+def test_a_file_goes_with_its_array(tmp_path):
+    def mapped() -> int:
+        return Path("/proc/self/maps").read_text().count(str(tmp_path))
+
+    room = InFiles(tmp_path, 1)
+    array = room.array((5000, 3), np.uint8)
+    assert mapped() == 1
+    del array
+    assert mapped() == 0
+    room.release_pages()
+
+
 def test_what_does_not_fit_is_refused_up_front(tmp_path):
     needs = MemoryNeeds(photos=3 * 10**9, step=10**9, rest=10**9)
     assert storage_for(needs, None, folder=tmp_path)[0] is IN_MEMORY

@@ -161,6 +161,7 @@ def load_album(
                 fills.append(placed[1])
         if len(photos) == len(frames):
             return Album(tuple(photos), colours, any(fills))
+        del colours, photos, place  # the next array takes their room
     raise AssertionError("four channels hold every photo")
 
 

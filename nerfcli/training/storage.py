@@ -7,6 +7,7 @@ system's cache or the disk when they are needed; results are the same, bit for b
 import mmap
 import os
 import tempfile
+import weakref
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -18,8 +19,12 @@ import torch
 from nerfcli.atomic import cannot_write
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import OUT_OF_MEMORY, UserError
-from nerfcli.field.kinds import NETWORK_BYTES, VOXEL_BYTES
+from nerfcli.field.fourier_field import FourierFieldSettings
+from nerfcli.field.hash_field import HashFieldSettings
+from nerfcli.field.interface import FieldSettings
+from nerfcli.field.kinds import chosen_size, parameter_bytes
 from nerfcli.machine import resident_bytes
+from nerfcli.matching.tracks import MOST_POINTS
 from nerfcli.training.runs.settings import TrainSettings
 
 
@@ -47,23 +52,28 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
         frame.image is not None and frame.image.suffix.lower() not in (".jpg", ".jpeg") for frame in frames
     )
     photos = (4 if may_have_alpha else 3) * sum(sizes) + 12 * sum(of_cameras.values())
-    if settings.components.occluders or any(frame.mask is not None for frame in frames):
-        photos += 9 * sum(sizes)
-    if settings.model == "auto":  # trials train on a list of pixels, those they are not scored on
-        photos += 9 * sum(sizes) + 12 * sum(of_cameras.values())
+    selects, components = settings.model == "auto", settings.components
+    may_have_occluders = components.occluders or (selects and "occluders" not in settings.fixed)
+    # Masks of one byte, and the list of the pixels that they leave; occluders also have masks of the sky, and trials
+    # train on pixels that they are not scored on.
+    photos += (9 * any(frame.mask is not None for frame in frames) + 10 * may_have_occluders + 9 * selects) * sum(sizes)
     largest = max(frame.camera.width * frame.camera.height for frame in frames)
     # The field, its gradient and two moments, and the sentinel's copy of all of these except the gradient.
-    step = 7 * field_bytes(settings) + 6000 * settings.samples_per_step
+    field = planned_field(settings)
+    neurons = field.layers * field.width if isinstance(field, FourierFieldSettings) else 0
+    step = 7 * parameter_bytes(field) + (6000 + 4 * 2 * neurons) * settings.samples_per_step
+    # Before there is a field, stereo matching has the directions from all photos to all points, float64 and float32.
+    has_stereo = selects or components.stereo or components.occluders or components.exposure == "matched"
+    stereo = 36 * len(frames) * MOST_POINTS if has_stereo else 0
     # To decode a photo: Pillow's picture, the array, and the intermediate results of downscaling.
-    rest = 12 * largest * min(settings.threads, len(frames)) + step
+    rest = 12 * largest * min(settings.threads, len(frames)) + max(step, stereo)
     return MemoryNeeds(photos, step, rest + resident_bytes())
 
 
-def field_bytes(settings: TrainSettings) -> int:
-    """Estimate the memory of one copy of a field's parameters."""
-    hash_rows = 8 * 16 * 2**settings.chosen_log2_rows  # 8 levels of 4 float32
-    usual = {"hash": hash_rows, "voxels": VOXEL_BYTES, "mlp": NETWORK_BYTES}
-    return settings.field_memory_bytes or usual[settings.field]
+def planned_field(settings: TrainSettings) -> FieldSettings:
+    """Return the size of a training's field, the largest where it depends on the photos."""
+    tables = HashFieldSettings("l2", log2_rows=settings.chosen_log2_rows)
+    return chosen_size(settings.field, hash_grid=tables, footprint=1e-9, memory_bytes=settings.field_memory_bytes)
 
 
 class InMemory:
@@ -88,7 +98,7 @@ class InFiles:
     def __init__(self, folder: Path, limit: int):
         self._folder = folder
         self._limit = limit
-        self._maps: list[mmap.mmap] = []
+        self._maps = weakref.WeakSet[mmap.mmap]()  # a file goes with its array
 
     def array(self, shape: tuple[int, ...], dtype: np.dtype | type) -> np.ndarray:
         """Return an array to be filled.
@@ -108,7 +118,7 @@ class InFiles:
                 pages = mmap.mmap(file.fileno(), size)
         except OSError as error:
             raise cannot_write(self._folder, error) from error
-        self._maps.append(pages)
+        self._maps.add(pages)
         return np.frombuffer(pages, dtype=dtype, count=int(np.prod(shape))).reshape(shape)
 
     def release_pages(self) -> None:

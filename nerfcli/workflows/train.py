@@ -21,7 +21,7 @@ from nerfcli.captures.loading import (
 from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.errors import UserError, duration, listed, several
 from nerfcli.field.hash_field import HashFieldSettings
-from nerfcli.field.kinds import chosen_size, closing_steps
+from nerfcli.field.kinds import chosen_size, closing_steps, parameter_bytes
 from nerfcli.machine import Resources, is_one_of_several
 from nerfcli.notices import Reporter, silent
 from nerfcli.output import Output
@@ -32,7 +32,7 @@ from nerfcli.training.runs.files import CONFIG, LOCK, METRICS, STATE
 from nerfcli.training.runs.run import Run, split_hash
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.training.schedule import WAYPOINTS, Schedule, StepPlan
-from nerfcli.training.storage import InFiles, field_bytes, needs_of, storage_for
+from nerfcli.training.storage import InFiles, needs_of, planned_field, storage_for
 
 # Width of a pixel at the centre of the scene, in units of the training frame, for a field whose photos are not read.
 LIKELY_FOOTPRINT = 1e-3
@@ -308,7 +308,7 @@ def plan_training(
         memory_bytes=min(total, limit) if limit else total,
         # The field and its waypoints, the state with both moments of the optimiser, and the previous state until the
         # next is written.
-        disk_bytes=(1 + len(WAYPOINTS) + 3 + 3) * field_bytes(settings) + in_files,
+        disk_bytes=(1 + len(WAYPOINTS) + 3 + 3) * parameter_bytes(planned_field(settings)) + in_files,
         seconds=settings.budget_seconds,
         steps=settings.steps,
         schedule=tuple(_likely_schedule(settings).plans()),
