@@ -359,6 +359,9 @@ def test_short_trainings_are_not_searched_for():
     assert Budget(60.0, None).allows_trials
     assert not Budget(None, 3000).allows_trials
     assert Budget(None, 5000).allows_trials
+    assert not Budget(600.0, 300).allows_trials  # the shorter of both
+    assert not Budget(9.0, 5000).allows_trials
+    assert Budget(600.0, 5000).of_search().of_start() == Budget(18.0, 150)
 
 
 def test_a_decision_says_in_words_what_was_and_what_was_not_tried():
@@ -496,6 +499,7 @@ def test_leaving_out_may_not_use_up_a_limit_of_time_but_may_use_up_steps():
         (Budget(100.0, None), time.perf_counter() - 60.0, True),
         (Budget(100.0, None), time.perf_counter() - 64.0, False),
         (Budget(None, 2100), 0.0, True),
+        (Budget(100.0, 200), time.perf_counter(), False),
     ):
         search = Search(scripted, start, Components(), budget=budget, began=began)  # type: ignore[arg-type]
         search.run([view])

@@ -104,16 +104,15 @@ class Budget:
 
     def of_start(self) -> "Budget":
         """Return the budget of the start of trials with this budget."""
-        if self.seconds is not None:
-            return Budget(START_FRACTION * self.seconds, MOST_START_STEPS)
-        return Budget(None, min(round(START_FRACTION * (self.steps or 0)), MOST_START_STEPS))
+        steps = MOST_START_STEPS if self.steps is None else min(round(START_FRACTION * self.steps), MOST_START_STEPS)
+        return Budget(None if self.seconds is None else START_FRACTION * self.seconds, steps)
 
     @property
     def allows_trials(self) -> bool:
         """Whether a start of trials would be long enough."""
-        if self.seconds is not None:
-            return START_FRACTION * SEARCH_FRACTION * self.seconds >= LEAST_START_SECONDS
-        return round(START_FRACTION * SEARCH_FRACTION * (self.steps or 0)) >= FEWEST_STEPS
+        part = START_FRACTION * SEARCH_FRACTION
+        has_time = self.seconds is None or part * self.seconds >= LEAST_START_SECONDS
+        return has_time and (self.steps is None or round(part * self.steps) >= FEWEST_STEPS)
 
     def allows_matching(self, seconds: float) -> bool:
         """Return whether photos may be matched in this time before the first step."""

@@ -121,7 +121,7 @@ class Search:
     Args:
         trials, start: the trials, and the training that they continue.
         requested: the components of the model to improve.
-        budget: of the start and all trials together: seconds, or steps where it has none.
+        budget: of the start and all trials together.
         began: `time.perf_counter` when the start began.
     """
 
@@ -187,16 +187,15 @@ class Search:
 
     def _can_run(self, trials: int, *, of_time: float = 1.0) -> bool:
         """Return whether the budget still allows some trials; only a fraction of a time budget may be used."""
-        if self._budget.seconds is not None:
-            spent = time.perf_counter() - self._began
-            return spent + trials * self._seconds_each <= of_time * self._budget.seconds
-        return self._steps + trials * self._length <= (self._budget.steps or 0)
+        seconds = time.perf_counter() - self._began + trials * self._seconds_each
+        has_time = self._budget.seconds is None or seconds <= of_time * self._budget.seconds
+        return has_time and (self._budget.steps is None or self._steps + trials * self._length <= self._budget.steps)
 
     def _is_cheap(self, trials: int) -> bool:
         """Return whether some trials cost no more than the fraction that is for removals."""
-        if self._budget.seconds is not None:
-            return trials * self._seconds_each <= REMOVAL_COST * self._budget.seconds
-        return trials * self._length <= REMOVAL_COST * (self._budget.steps or 0)
+        seconds, steps = self._budget.seconds, self._budget.steps
+        has_time = seconds is None or trials * self._seconds_each <= REMOVAL_COST * seconds
+        return has_time and (steps is None or trials * self._length <= REMOVAL_COST * steps)
 
     def _trial(self, changes: dict[str, Any], *, seed: int) -> Trial:
         began = time.perf_counter()

@@ -223,7 +223,7 @@ def select(trials: Trials, requested: Components, facts: Facts, budget: Budget) 
 
     Args:
         requested: the components to keep where nothing supports a change.
-        budget: of all trials together; steps count only where there is no time budget.
+        budget: of all trials together.
 
     Returns:
         The selection; if the budget is too small for a first training of `FEWEST_STEPS`, only what needs no trial.
