@@ -371,6 +371,21 @@ def test_machine_code_is_kept_on_disk_and_damage_is_noticed(monkeypatch, tmp_pat
         compiled(variant, 90)
 
 
+def test_a_change_of_a_constant_of_the_reference_outdates_the_machine_code(monkeypatch, tmp_path):
+    """Kernels have constants of other folders, such as `MOST_DEVIATION`."""
+    monkeypatch.setenv("NERFCLI_KERNEL_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(cubin, "__file__", str(tmp_path / "triton_cuda" / "cubin.py"))
+    monkeypatch.setattr(cubin, "_environment", cubin._environment.__wrapped__)
+    monkeypatch.setattr(cubin, "compile_now", lambda variant, capability: Cubin("kernel", b"c", "p", "Q", 4, 0))
+    constants = tmp_path / "reference" / "compositing.py"
+    constants.parent.mkdir()
+    constants.write_text("MOST_DEVIATION = 0.25\n")
+    compiled(launch.variant_of(launch._count, (torch.zeros(4), 7, 0.5, 4), {"BLOCK": 32}, warps=4, stages=1), 90)
+    assert cubin.is_compiled()
+    constants.write_text("MOST_DEVIATION = 0.5\n")
+    assert not cubin.is_compiled()
+
+
 def test_the_cache_is_bounded_and_what_was_used_least_recently_goes_first(monkeypatch, tmp_path):
     """Files of other versions, and those that another process writes or removes at the same time."""
     monkeypatch.setenv("NERFCLI_KERNEL_CACHE", str(tmp_path))

@@ -39,9 +39,10 @@ from nerfcli.kernels import (
 from nerfcli.kernels.contraction import contract
 from nerfcli.kernels.selftest.measure import MET, Precision
 from nerfcli.kernels.selftest.table import OF_GPU, checks, row_of
-from nerfcli.kernels.triton_cuda import compositing, coordinates, hash_grid, marching, networks
+from nerfcli.kernels.triton_cuda import compositing, coordinates, hash_grid, launch, marching, networks
 from nerfcli.kernels.triton_cuda.backend import TritonBackend
 from nerfcli.kernels.triton_cuda.launch import seen
+from nerfcli.kernels.triton_cuda.warm_up import warm_up
 
 # Relative tolerances: of float32, and of values that pass through float16 (11 bits) and sums of them.
 SINGLE, HALF = RELATIVE, 6e-3
@@ -405,6 +406,20 @@ def test_far_points_contract_as_in_the_reference(generator):
     found = marching.occupied_samples(rays, march)[2]
     assert_close(found, contract(points.double()) / 4 + 0.5, "coordinates")
     assert math.isfinite(float(found.sum()))
+
+
+def test_all_branches_are_compiled_before_a_budget_begins(monkeypatch):
+    launched: dict[Any, None] = {}
+    monkeypatch.setattr(launch, "seen", launched)
+    monkeypatch.setattr(launch, "INTERPRETED", True)  # elsewhere, `launch` notes no variants
+    warm_up(DEVICE)
+    seen.update(launched)
+    found = {(variant.kernel.fn.__name__, *item) for variant in launched for item in variant.constants}
+    values = {"VISITS": (False, True), "FADES": (False, True), "GRIDS": (False, True), "CHANNELS": (3, 4)}
+    values |= {"DEGREE": (0, 3), "RAYS_LEARN": (False, True), "CONTRACTION": (0, 1)}
+    branches = {(kernel, name) for kernel, name, _ in found if name in values}
+    wanted = {(kernel, name, value) for kernel, name in branches for value in values[name]}
+    assert wanted <= found
 
 
 OF_SELFTEST = Precision(OF_GPU, torch.float32, str(DEVICE), for_gpu=True)

@@ -190,6 +190,6 @@ def _environment() -> str:
     """Return a digest of the sources of the kernels and the versions of Triton and Python."""
     versions = f"{triton.__version__} {sys.version_info[:2]} {platform.machine()}"
     content = hashlib.blake2b(versions.encode(), digest_size=8)
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(Path(__file__).parent.parent.rglob("*.py")):  # kernels have constants of the reference
         content.update(path.name.encode() + b"\0" + path.read_bytes())
     return content.hexdigest()
