@@ -19,6 +19,7 @@ from nerfcli.field.background import SphereBackground, colours_behind
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.exposure import Exposure, exposed, linear_from_srgb, srgb_from_linear
 from nerfcli.field.hash_field import DETAILED_LOG2_ROWS
+from nerfcli.photos import exif
 from nerfcli.photos.exif import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.model import load_model
@@ -169,12 +170,26 @@ def test_exif_gives_stops_between_photos(capture, tmp_path):
     save_photo(tmp_path / "silent.png", seconds=None)
     others = [Frame(name, CAMERA, pose(0), tmp_path / name) for name in ("wide.png", "silent.png")]
     assert (log_exposures(others) / math.log(2) - stops[0])[0] == pytest.approx(4.0)
-    reference = mean_log_exposure(capture.train_frames)
-    assert relative_log_exposures([*capture.test_frames, others[1]], reference).tolist() == pytest.approx(
+    reference = mean_log_exposure(log_exposures(capture.train_frames))
+    assert relative_log_exposures(
+        log_exposures([*capture.test_frames, others[1]]), reference
+    ).tolist() == pytest.approx(
         [-2 * math.log(2), 0.0]  # a photo without exposure in EXIF counts as the mean
     )
-    assert mean_log_exposure(others[1:]) is None
-    assert relative_log_exposures(capture.frames, None).tolist() == [0.0] * 4
+    assert mean_log_exposure(log_exposures(others[1:])) is None
+    assert relative_log_exposures(stops, None).tolist() == [0.0] * 4
+
+
+def test_the_exif_of_a_photo_is_read_once_before_training(capture, tmp_path, monkeypatch):
+    read, opened = exif.read_exif, list[Path]()
+
+    def noted(path: Path) -> exif.Exif:
+        opened.append(path)
+        return read(path)
+
+    monkeypatch.setattr(exif, "read_exif", noted)
+    prepare(capture, SHORT, run=tmp_path, notify=lambda text: None)
+    assert sorted(map(str, opened)) == sorted(str(frame.image) for frame in capture.train_frames)
 
 
 def test_a_sphere_interpolates_its_grid_and_one_vertex_is_one_colour():
@@ -331,7 +346,8 @@ def test_a_run_keeps_background_and_exposures_and_goes_on_bit_for_bit(capture, t
     model = load_model(tmp_path / "parts" / "field.safetensors", "cpu")
     assert isinstance(model.background, SphereBackground)
     assert torch.equal(model.background.logits, states[0]["parts.background.logits"])
-    assert Run(tmp_path / "parts").exposures.log_exposure == pytest.approx(mean_log_exposure(capture.train_frames))
+    reference = mean_log_exposure(log_exposures(capture.train_frames))
+    assert Run(tmp_path / "parts").exposures.log_exposure == pytest.approx(reference)
 
 
 def test_empty_space_shows_the_background_by_direction_whatever_the_tile(capture, tmp_path, monkeypatch):

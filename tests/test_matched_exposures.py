@@ -63,14 +63,13 @@ def test_white_pixels_give_no_evidence():
     ],
     ids=["confirms", "all alike", "unknown", "contradicts"],
 )
-def test_exposures_count_where_exif_confirms_them(exif, is_kept, monkeypatch):
+def test_exposures_count_where_exif_confirms_them(exif, is_kept):
     """EXIF has to confirm them because shiny surfaces differ from photo to photo, too."""
     gains = [-0.6, 0.6, -0.3, 0.3, 0.0, 0.1]
     photos = [exposed(photo(0.12 * k, contrast=1.5), np.full(3, gain)) for k, gain in enumerate(gains)]
-    monkeypatch.setattr("nerfcli.training.evidence.log_exposures", lambda frames: np.array(exif))
     found = matched_log_gains(photos, [depth(one) for one in photos])
     assert found.mean(1) == pytest.approx(np.array(gains) - np.mean(gains), abs=0.03)
-    confirmed = confirmed_by_exif(found, photos)
+    confirmed = confirmed_by_exif(found, np.array(exif))
     assert np.isfinite(confirmed).all() == is_kept
     spread = Evidence(may_match=True, log_gains=confirmed).exposure_spread
     assert spread == pytest.approx(np.std(gains) if is_kept else 0.0, abs=0.03)

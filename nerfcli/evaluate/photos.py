@@ -10,6 +10,7 @@ predictions/color-float/NAME.npy   the rendered picture before rounding, float32
 
 import json
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -139,17 +140,18 @@ def held_out_photos(run: Run, frames: Sequence[Frame]) -> list[HeldOutPhoto]:
 def training_billboards(run: Run, *, notify: Callable[[str], None]) -> Billboards | None:
     """Build the billboards of a run's training photos; None, with a line for the user, if a photo cannot be read."""
     factor, masks = run.config.downscale, run.components.masks
-    small, cameras = [], []
+
+    def loaded(frame: Frame) -> LoadedPhoto:
+        trained = replace(frame, camera=downscaled_camera(frame.camera, factor))
+        return load_photo(frame, factor * reduction(trained), masks)
+
     try:
-        for frame in run.cameras.train:
-            trained = replace(frame, camera=downscaled_camera(frame.camera, factor))
-            (photo,) = load_photos([frame], factor=factor * reduction(trained), threads=1, masks=masks)
-            cameras.append(photo.frame)
-            small.append(over_white(photo.pixels))
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+            photos = list(pool.map(loaded, run.cameras.train))
     except UserError as error:
         notify(f"no comparison with a model without geometry: {error}")
         return None
-    return Billboards(cameras, small)
+    return Billboards([photo.frame for photo in photos], [over_white(photo.pixels) for photo in photos])
 
 
 PREDICTIONS = "predictions"

@@ -169,17 +169,17 @@ def log_exposures(frames: Sequence[Frame]) -> np.ndarray:
     return np.array([_log_exposure(frame) for frame in frames], dtype=np.float64)
 
 
-def mean_log_exposure(frames: Sequence[Frame]) -> float | None:
+def mean_log_exposure(exposures: np.ndarray) -> float | None:
     """Return the mean of `log_exposures` over photos with a known exposure; None without any."""
-    exposures = [value for value in log_exposures(frames) if math.isfinite(value)]
-    return math.fsum(exposures) / len(exposures) if exposures else None
+    known = exposures[np.isfinite(exposures)]
+    return math.fsum(known) / len(known) if len(known) else None
 
 
-def relative_log_exposures(frames: Sequence[Frame], reference: float | None) -> np.ndarray:
+def relative_log_exposures(exposures: np.ndarray, reference: float | None) -> np.ndarray:
     """Return `log_exposures` minus `reference`; 0 where either is unknown."""
     if reference is None:
-        return np.zeros(len(frames))
-    return np.nan_to_num(log_exposures(frames) - reference, nan=0.0)
+        return np.zeros(len(exposures))
+    return np.nan_to_num(exposures - reference, nan=0.0)
 
 
 def _log_exposure(frame: Frame) -> float:

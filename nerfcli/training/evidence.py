@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -114,6 +115,11 @@ class TrainingPhotos:
         """Whether no 3D points tell about the cameras, and photos that fill the frame can."""
         return self.album.fills_frame and len(self.scene.points) == 0
 
+    @cached_property
+    def log_exposures(self) -> np.ndarray:
+        """Logarithms (photos,) of their exposures by EXIF, see `photos.exif.log_exposures`."""
+        return log_exposures(self.scene.train_frames)
+
 
 def may_use_points(
     requested: Components, fixed: tuple[str, ...], *, has_alpha: bool, cameras: CameraCheck | None
@@ -184,7 +190,9 @@ def collect_evidence(
         with found.timed("exposures"):
             log_gains = matched_log_gains(album, dense)
         if with_exposures:  # those that a user asks for need no confirmation
-            found.log_gains = log_gains if wanted.exposure == "matched" else confirmed_by_exif(log_gains, album)
+            found.log_gains = (
+                log_gains if wanted.exposure == "matched" else confirmed_by_exif(log_gains, photos.log_exposures)
+            )
         if with_occluders:
             with found.timed("occluders"):
                 skies = skies or sky_masks(album, threads=threads)
@@ -312,13 +320,12 @@ def _find_sky(found: Evidence, skies: list[np.ndarray], photos: TrainingPhotos, 
     found.sky = torch.from_numpy(np.concatenate([mask.ravel() for mask in skies])).to(device)
 
 
-def confirmed_by_exif(log_gains: np.ndarray, photos: Sequence[LoadedPhoto]) -> np.ndarray:
+def confirmed_by_exif(log_gains: np.ndarray, exif: np.ndarray) -> np.ndarray:
     """Return exposures from shared pixels, (photos, 3); all NaN if EXIF does not confirm them.
 
     Surfaces that look brighter from one side differ between photos just as exposures do, and their differences add up
     along a ring of cameras.
     """
-    exif = log_exposures([photo.frame for photo in photos])
     measured = np.isfinite(log_gains).all(1) & np.isfinite(exif)
     places = np.flatnonzero(measured)
     if len(places) < FEWEST_EXIF or exif_slope(places, log_gains[measured], exif[measured]) == 0.0:

@@ -19,7 +19,7 @@ from nerfcli.errors import UserError, several
 from nerfcli.machine import default_memory_limit
 from nerfcli.matching.correspondences import SharedFeatures
 from nerfcli.matching.tracks import triangulate
-from nerfcli.photos.exif import log_exposures, mean_log_exposure, relative_log_exposures
+from nerfcli.photos.exif import mean_log_exposure, relative_log_exposures
 from nerfcli.training.evidence import LEARN_FOCAL, Evidence, TrainingPhotos, collect_evidence, tracks_of_model
 from nerfcli.training.extent import Extent, choose_extent, lacks_depth
 from nerfcli.training.fitting import TrainingInputs
@@ -103,7 +103,7 @@ def prepare(
 
     inputs = _with_evidence(inputs, settings.components, evidence)
     _check_depths(scene, inputs, evidence, notify=notify)
-    log_exposure, log_gains = _exposures(scene, settings.components, evidence, selection, notify=notify)
+    log_exposure, log_gains = _exposures(photos, settings.components, evidence, selection, notify=notify)
     return replace(
         inputs,
         selection=selection if begun is None else begun.selection,
@@ -168,12 +168,12 @@ def _select(
 
 def _facts(photos: TrainingPhotos, settings: TrainSettings, evidence: Evidence) -> Facts:
     """Return what the selection needs to know about the scene."""
-    frames, depths = photos.scene.train_frames, (evidence.track_depths, evidence.stereo_depths, evidence.sensor_depths)
+    exif, depths = photos.log_exposures, (evidence.track_depths, evidence.stereo_depths, evidence.sensor_depths)
     points, stereo, sensor = (0 if one is None else len(one.numbers) for one in depths)
     return Facts(
         settings.field,
         has_alpha=photos.album.colours.shape[-1] == 4,
-        has_exif=bool(np.ptp(relative_log_exposures(frames, mean_log_exposure(frames))) > 0.0),
+        has_exif=bool(np.ptp(relative_log_exposures(exif, mean_log_exposure(exif))) > 0.0),
         cameras_known=_known(photos.scene)
         or (None if evidence.may_match else "the budget is too short to match photos"),
         cameras=evidence.cameras,
@@ -183,7 +183,7 @@ def _facts(photos: TrainingPhotos, settings: TrainSettings, evidence: Evidence) 
         sky_fraction=evidence.sky_fraction,
         sky_confirmed=evidence.sky_confirmed,
         occluded_fraction=evidence.occluded_fraction,
-        photos=len(frames),
+        photos=len(exif),
         exposure_spread=evidence.exposure_spread,
         fixed=settings.fixed,
     )
@@ -235,7 +235,7 @@ def _check_depths(scene: Capture, inputs: TrainingInputs, evidence: Evidence, *,
 
 
 def _exposures(
-    scene: Capture,
+    photos: TrainingPhotos,
     components: Components,
     evidence: Evidence,
     selection: Selection | None,
@@ -246,11 +246,12 @@ def _exposures(
 
     The latter are those that trials have found, else from pixels that photos share, else from EXIF.
     """
-    frames = scene.train_frames
-    reference = None if components.exposure == "none" else mean_log_exposure(frames)
+    none = np.full(len(photos.scene.train_frames), np.nan)
+    exif = none if components.exposure == "none" else photos.log_exposures
+    reference = mean_log_exposure(exif)
     if reference is not None:
-        notify(f"EXIF gives the exposure of {np.isfinite(log_exposures(frames)).sum()} of {len(frames)} photos")
-    by_exif = torch.from_numpy(relative_log_exposures(frames, reference))[:, None].expand(-1, 3)
+        notify(f"EXIF gives the exposure of {np.isfinite(exif).sum()} of {len(exif)} photos")
+    by_exif = torch.from_numpy(relative_log_exposures(exif, reference))[:, None].expand(-1, 3)
     if selection is not None and selection.log_gains is not None:
         return reference, selection.log_gains
     matched = None if evidence.log_gains is None else torch.from_numpy(evidence.log_gains)

@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 from nerfcli.cameras.camera import Camera
 from nerfcli.errors import UserError, listed, several
 from nerfcli.matching.stereo import DenseDepth
+from nerfcli.matching.tracks import indices_by_value
 from nerfcli.photos.sensor_depth import DepthReadings, read_sensor_depth
 from nerfcli.training.pool import PixelPool, PointDepths
 
@@ -177,10 +178,9 @@ def _read(pool: PixelPool, chosen: Sequence[int], unreadable: dict[str, str]) ->
 def seen_points(known: PointDepths, pool: PixelPool, *, training_scale: float) -> list[SeenPoints]:
     """Return known distances as the points of each photo."""
     numbers, distances = known.numbers.cpu().numpy(), known.distances.cpu().numpy().astype(np.float64)
-    photos = pool.photo_of(known.numbers).cpu().numpy()
+    by_photo = indices_by_value(pool.photo_of(known.numbers).cpu().numpy(), len(pool.cameras))
     found = []
-    for i, (camera, first) in enumerate(zip(pool.cameras, pool.first_pixel.tolist(), strict=True)):
-        own = np.flatnonzero(photos == i)
+    for camera, first, own in zip(pool.cameras, pool.first_pixel.tolist(), by_photo, strict=True):
         row, column = np.divmod(numbers[own] - first, camera.width)
         pixels = np.stack([column, row], axis=-1) + 0.5
         z = distances[own] * _cosines(camera, pixels) / training_scale

@@ -22,7 +22,7 @@ from nerfcli.field.background import SphereBackground
 from nerfcli.field.exposure import linear_from_srgb
 from nerfcli.field.hash_field import HashField
 from nerfcli.photos.colours import psnr_of
-from nerfcli.photos.exif import mean_log_exposure, relative_log_exposures
+from nerfcli.photos.exif import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.training.appearance import LEAST_LEVEL
 from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.optimiser import Adam
@@ -218,7 +218,8 @@ class Trials:
         self._scored = pool.rays_of(torch.from_numpy(numbers).to(pool.colours.device))
         self._photos = pool.photo_of(self._scored.numbers).cpu().numpy()
         self._counts = np.bincount(self._photos, minlength=len(pool.frames)) * 3
-        exif = relative_log_exposures(pool.frames, mean_log_exposure(pool.frames))
+        exif = log_exposures(pool.frames)
+        exif = relative_log_exposures(exif, mean_log_exposure(exif))
         self._exif = torch.from_numpy(exif).to(torch.float32)[:, None].expand(-1, 3)
         depths = [] if inputs.points is None else [one.among(self._pool) for one in inputs.points.sets]
         points = PointRays(depths, self._pool)

@@ -27,7 +27,7 @@ from nerfcli.evaluate.photos import held_out_photos
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.notices import Reporter
 from nerfcli.output import Output
-from nerfcli.photos.exif import mean_log_exposure, relative_log_exposures
+from nerfcli.photos.exif import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.photos.images import read_image
 from nerfcli.training.runs.components import CHOICES
 from nerfcli.training.runs.files import STATE
@@ -108,11 +108,11 @@ def _capture(scene: Capture) -> CaptureTraits:
     """Return the traits of a scene that decide which components can be varied."""
     first, sparse = scene.train_frames[0].image, find_model(scene.root)
     seen = parse_colmap(sparse).observations if sparse is not None else None
-    exif = relative_log_exposures(scene.train_frames, mean_log_exposure(scene.train_frames))
+    exif = log_exposures(scene.train_frames)
     return CaptureTraits(
         has_alpha=first is not None and read_image(first).shape[-1] == 4,
         has_points=seen is not None and len(seen.pixels) > 0,
-        has_exif=bool(np.ptp(exif) > 0.0),
+        has_exif=bool(np.ptp(relative_log_exposures(exif, mean_log_exposure(exif))) > 0.0),
     )
 
 
