@@ -208,7 +208,6 @@ class Scripted:
         self.gain, self.spread, self.far = gain, spread, far
         self.requested: list[tuple[Components, int, int]] = []
         self.begun: list[Components] = []
-        self.from_psnr: set[float] = set()
 
     def begin(self, components: Components, budget: Budget, *, fewest: int = 0) -> TrialStart | None:
         self.begun.append(components)
@@ -220,7 +219,6 @@ class Scripted:
 
     def go_on(self, start: TrialStart, components: Components, *, seed: int, steps: int) -> Trial:
         self.requested.append((components, seed, steps))
-        self.from_psnr.add(start.trial.psnr)
         return trial(20.0 + seed + self.gain(components))
 
 

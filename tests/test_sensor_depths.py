@@ -154,7 +154,7 @@ def test_the_view_of_a_depth_camera_beside_the_photos_is_found(tmp_path):
         moved = fit.registration.in_map(np.array([[0.5, 0.5]]), np.array([z]))[0]
         assert moved == pytest.approx([0.5 + 1.1 * 120.0 * 0.025 / z / 160, 0.5], abs=2 / 120)
     assert np.percentile(np.abs(errors(measured(pool, said))), 98) < 0.01
-    assert "its view is another than the photos', 0.91 as wide" in said[0]
+    assert "its view differs from the photos': it is 0.91 times as wide" in said[0]
 
 
 def test_a_registration_and_its_inverse_undo_each_other():

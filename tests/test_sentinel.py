@@ -62,6 +62,7 @@ def test_steps_that_are_too_large_end_with_exit_5_and_a_file_that_repeats_the_fa
     assert caught.value.exit_code == NON_FINITE
     assert "in train/r_00" in caught.value.message
     assert "failure-2.safetensors has the state before the failure" in caught.value.hint
+    assert "checkpoint" not in caught.value.hint  # there is none yet
     description, bad = replay(tmp_path / "run" / "failure-2.safetensors")
     assert bad is not None
     assert bad.name == "colour of samples"

@@ -52,7 +52,7 @@ class March(NamedTuple):
         max_optical_depth: > 0; each ray ends at the sample where its optical depth reaches this.
         least_weight: >= 0; samples that absorb a smaller fraction of their ray's light may be left out, but never all.
         distances: `reference.distances_to_occupied` of `occupied`, to skip empty space faster; None if that is not
-            worth while.
+            worthwhile.
     """
 
     edges: Tensor

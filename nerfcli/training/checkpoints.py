@@ -56,10 +56,10 @@ ALPHA_BACKGROUND = (1.0, 1.0, 1.0)
 
 @dataclass
 class Totals:
-    """Totals over the whole training, including resumed parts; `searched` is the time spent selecting components."""
+    """Totals over the whole training, including resumed parts; `prepared` is the time before the first step."""
 
     seconds: float = 0.0
-    searched: float = 0.0
+    prepared: float = 0.0
     samples: int = 0
     rays: int = 0
 
@@ -220,7 +220,9 @@ def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description
         )
     refuse_non_finite(that_must_be_finite(tensors), run / STATE)
     fitting.restore(tensors, description)
-    return Totals(**description["totals"])
+    totals = dict(description["totals"])
+    prepared = totals.pop("searched", 0.0)  # the name in earlier versions
+    return Totals(**{"prepared": prepared, **totals})
 
 
 WAYPOINTS_FOLDER = "waypoints"

@@ -50,7 +50,7 @@ class Evidence:
     """What the training photos tell; None, 0 or False where it is not needed or not known.
 
     Args:
-        may_match: whether the budget allows to match the photos.
+        may_match: whether the budget allows matching the photos.
         cameras: the cameras against matched features.
         sky_fraction: fraction of the pixels that look like a sky, see `matching.sky`; 0 if that is enough for one, but
             3D points are in front.
@@ -61,7 +61,7 @@ class Evidence:
         sensor_depths: from a sensor's maps.
         log_gains: (photos, 3) logarithms of exposures from pixels that several photos share; NaN where unknown.
         occluders: for each photo the mask (H, W) of pixels where something hides a surface that other photos see.
-        seconds: that each took, by name.
+        seconds: how long each took, by name.
     """
 
     may_match: bool

@@ -63,7 +63,7 @@ class TrainingInputs:
             if unknown or not used.
         occluders: for each photo of the pool the mask (height, width) bool of the pixels that are left out because
             something hides a surface there; None if the components keep them.
-        seconds: of the budget, that evidence and trials took, by name.
+        seconds: seconds of the budget spent on evidence and trials, by name.
     """
 
     settings: TrainSettings

@@ -128,8 +128,8 @@ def train(
         forget_waypoints(run, after=fitting.step)
         notify(f"resumed at step {fitting.step}, {totals.seconds:.1f} s")
     else:
-        searched = sum(inputs.seconds.values())
-        totals = Totals(seconds=searched, searched=searched)
+        prepared = sum(inputs.seconds.values())
+        totals = Totals(seconds=prepared, prepared=prepared)
         _clear(run)
     write_left_out(run, inputs, notify=notify)
     chosen = replace(settings, downscale=inputs.factor, contraction=inputs.extent.contraction)
@@ -159,7 +159,7 @@ def train(
             raise
         checkpoints.finish()
     if fitting.rollbacks:
-        notify(f"numbers became non-finite {fitting.rollbacks} times; the states before that are in {run}/failure-*")
+        notify(f"numbers became non-finite {fitting.rollbacks} times; the state before each is in {run}/failure-*")
     if distributed.rank() == 0:
         measure_waypoints(checkpoints.frames()[1], run, inputs, notify=notify)
 
@@ -218,7 +218,7 @@ def _run(
     budget = Budget.of(fitting.settings)
 
     def progress() -> float:
-        return budget.progress(fitting.step, totals.seconds, before=totals.searched)
+        return budget.progress(fitting.step, totals.seconds, before=totals.prepared)
 
     waypoints = [waypoint for waypoint in WAYPOINTS if waypoint > progress()]
     try:

@@ -66,20 +66,20 @@ class Occupancy:
     def __init__(self, side: int, device: torch.device):
         self.optical_depth = torch.full((side, side, side), torch.inf, device=device)
 
-    def above(self, optical_depth: float) -> Tensor:
+    def above(self, threshold: float) -> Tensor:
         """Return the cells, (side, side, side) bool indexed [z, y, x], above `least` or never evaluated.
 
         A cell with NaN counts as above, so that rays sample it and the loss detects the NaN.
         """
-        return ~(self.optical_depth <= self.least(optical_depth))
+        return ~(self.optical_depth <= self.least(threshold))
 
-    def least(self, optical_depth: float) -> Tensor:
-        """Return the threshold, (): this optical depth, or the mean over all cells if that is less.
+    def least(self, threshold: float) -> Tensor:
+        """Return the optical depth above which cells are open, (): the threshold, or the mean of all if that is less.
 
         In a short training, all of space may still be fog below any fixed threshold; cells that rays skip would not
         learn any more.
         """
-        return self.optical_depth.nanmean().clamp_max(optical_depth)
+        return self.optical_depth.nanmean().clamp_max(threshold)
 
     @torch.no_grad()
     def refresh(

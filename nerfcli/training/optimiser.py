@@ -276,8 +276,8 @@ class NewtonSteps(nn.Module):
 
             -(H + damping diag(H) + L)^-1 (slope + L so_far),  L = holding diag(mean H) / spread^2, in square pixels
 
-        L holds back translations and rotations, each as one kind, the more the less all photos have moved in that way
-        so far. Errors of the cameras show in directions that the photos determine; the same kind of change is then
+        L holds back translations and rotations, each as one kind: the less all photos have moved in that way so far,
+        the more. Errors of the cameras show in directions that the photos determine; the same kind of change is then
         preferred in directions that they do not. Centres that were right stay right, and so do whole cameras.
 
         Args:

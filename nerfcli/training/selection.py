@@ -1,6 +1,6 @@
 """Select the components of a model: by evidence, and by paired short trainings where that does not decide.
 
-A component is added only if its gain exceeds the noise, and removed only if that surely loses hardly anything. Gain
+A component is added only if its gain exceeds the noise, and removed only if hardly anything can be lost by it. Gain
 and noise are measured, not assumed: every candidate continues the same start with the same seeds and pixels as the
 model that it would change, and the variation of the gains between seeds and between photos gives their error. Each is
 tried on top of the components kept so far: of two that correct the same fault, one is enough.

@@ -139,7 +139,11 @@ def sensor_depths(
         depths[i] = DenseDepth(places[kept], distances, expected)
     parts = [
         f"depths of the sensor: {total - off:,} pixels, {fit.scale:.4g} scene units per metre, {_agreement(fit)}",
-        *([f"its view is another than the photos', {1 / fit.registration.zoom:.2f} as wide"] if _is_moved(fit) else []),
+        *(
+            [f"its view differs from the photos': it is {1 / fit.registration.zoom:.2f} times as wide"]
+            if _is_moved(fit)
+            else []
+        ),
         f"left out where points disagree: {100 * off / max(1, total):.1f} % of the pixels"
         + (f", and all of {several(len(differing), 'photo')}: {listed(differing)}" if differing else ""),
         *_unread(unreadable),

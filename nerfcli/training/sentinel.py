@@ -28,6 +28,7 @@ from nerfcli.render.trained_field import Marching
 from nerfcli.training.extent import Extent
 from nerfcli.training.fitting import Fitting, StepResult, TrainingInputs
 from nerfcli.training.pool import PixelBatch, PixelPool
+from nerfcli.training.runs.files import STATE
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.step import NonFiniteError, Watch
 
@@ -182,10 +183,10 @@ class Sentinel:
         path, text = self._keep(self._progress[done - 1], bad)
         self._go_back()
         if fitting.rollbacks == MOST_ROLLBACKS:
+            kept = "the last checkpoint is kept; " if (self._run / STATE).exists() else ""
             raise UserError(
                 f"{text}, despite {MOST_ROLLBACKS} retries with smaller steps",
-                f"the last checkpoint is kept; {path} has the state before the failure (nerfcli info repeats the "
-                "step); try another --seed",
+                f"{kept}{path} has the state before the failure (nerfcli info repeats the step); try another --seed",
                 NON_FINITE,
             )
         fitting.smaller_steps()

@@ -156,7 +156,7 @@ class Trial:
         errors: (photos,) sums of squared differences of the judged pixels of each photo, sRGB.
         halfway: the same after half of its steps.
         counts: (photos,) numbers of values that were summed.
-        seconds: that it took.
+        seconds: how long it took.
         log_gains: (photos, 3) exposures of its model; None if it has none.
     """
 
@@ -167,11 +167,6 @@ class Trial:
     steps: int
     log_gains: Tensor | None = None
 
-    @property
-    def psnr(self) -> float:
-        """PSNR in dB over all judged pixels."""
-        return psnr_of(float(self.errors.sum() / self.counts.sum()))
-
 
 @dataclass(frozen=True)
 class TrialStart:
@@ -179,7 +174,7 @@ class TrialStart:
 
     Args:
         tensors, description: its state.
-        seconds: that it took.
+        seconds: how long it took.
         trial: its result.
         signs: diagnostics from its residuals.
     """

@@ -35,15 +35,17 @@ def _forward(
             own = np.float64(density[i]) * np.float64(lengths[i])
             weight = np.exp(-depth) * -np.expm1(-own)
             weights[i] = weight
-            red += weight * rgb[i, 0]
-            green += weight * rgb[i, 1]
-            blue += weight * rgb[i, 2]
+            if rgb is not None:  # decided when this is compiled
+                red += weight * rgb[i, 0]
+                green += weight * rgb[i, 1]
+                blue += weight * rgb[i, 2]
             depth += own
         left = np.exp(-depth)
         transmittance[ray] = left
-        colour[ray, 0] = red + left * background[ray, 0]
-        colour[ray, 1] = green + left * background[ray, 1]
-        colour[ray, 2] = blue + left * background[ray, 2]
+        if rgb is not None:
+            colour[ray, 0] = red + left * background[ray, 0]
+            colour[ray, 1] = green + left * background[ray, 1]
+            colour[ray, 2] = blue + left * background[ray, 2]
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
@@ -80,17 +82,6 @@ def _backward(
             rgb_gradient[i, 0] = weight * gr
             rgb_gradient[i, 1] = weight * gg
             rgb_gradient[i, 2] = weight * gb
-
-
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _weights(density: Any, lengths: Any, offsets: Any, weights: Any, transmittance: Any) -> None:
-    for ray in numba.prange(offsets.shape[0] - 1):
-        depth = 0.0
-        for i in range(offsets[ray], offsets[ray + 1]):
-            own = np.float64(density[i]) * np.float64(lengths[i])
-            weights[i] = np.exp(-depth) * -np.expm1(-own)
-            depth += own
-        transmittance[ray] = np.exp(-depth)
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
@@ -191,6 +182,6 @@ def interval_weights(density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple
     """See `reference.interval_weights`; float32 on the CPU, without gradients."""
     use_threads()
     weights, transmittance = torch.empty_like(density), torch.empty(len(offsets) - 1)
-    arrays = (density.detach().contiguous(), lengths.contiguous(), offsets, weights, transmittance)
-    _weights(*(x.numpy() for x in arrays))
+    given, spans = density.detach().contiguous().numpy(), lengths.contiguous().numpy()
+    _forward(given, None, spans, offsets.numpy(), None, None, transmittance.numpy(), weights.numpy())
     return weights, transmittance

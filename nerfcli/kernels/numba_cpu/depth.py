@@ -1,7 +1,7 @@
 """Depth of rays on CPU threads, one ray at a time: mean, spread, heaviest interval and quantiles in one pass.
 
-Same operation as `depth.ray_termination`, for float32; everything is computed in float64. Mean and variance are updated
-sample by sample around the mean so far, which avoids cancellation.
+Same operation as `reference.ray_termination`, for float32; everything is computed in float64. Mean and variance are
+updated sample by sample around the mean so far, which avoids cancellation.
 Source: West 1979, Updating mean and variance estimates, CACM 22(9).
 """
 
@@ -86,7 +86,7 @@ def _ray_termination(
 def ray_termination(
     density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, fractions: tuple[float, ...]
 ) -> RayTermination:
-    """See `depth.ray_termination`; float32 on the CPU, without gradients."""
+    """See `reference.ray_termination`; float32 on the CPU, without gradients."""
     use_threads()
     sums, quantiles, targets = new_sums(len(offsets) - 1, fractions)
     arrays = [x.detach().contiguous().numpy() for x in (density, starts, ends, offsets)]

@@ -129,7 +129,7 @@ def depth_loss(
     sum_i weight_i min(1, |middle_i - distance| / (c distance)) + transmittance,  c = 0.25
 
     Light that is absorbed a fraction c of the distance away or more, or not at all, counts 1. So a wrong distance pulls
-    no harder than a right one, once reached, holds.
+    no harder than a right one holds once it is reached.
 
     Args:
         weights, middles: (N,) weights and midpoints of the intervals.

@@ -256,7 +256,7 @@ class Selection:
         decisions: one per candidate; empty if the budget was too small.
         seconds: seconds spent on the search.
         log_gains: (photos, 3) log gains of exposure that the trials found; None where exposures are not learned.
-        log_focal: see `Fitting`.
+        log_focal: see `TrainingInputs`.
     """
 
     components: Components
