@@ -173,7 +173,7 @@ def test_cameras_of_a_scene_are_for_upright_photos(camera, tmp_path):
     write_colmap_binary(capture, tmp_path / "sparse/0")
     result = nerfcli("convert", tmp_path, tmp_path / "scene", "--to", "nerfcli")
     assert result.exit_code == 0, result.stderr
-    assert "3 photos have an EXIF orientation: their cameras refer to pixels upright" in result.stderr
+    assert "3 photos have an EXIF orientation: the cameras refer to pixels upright" in result.stderr
     scene = load_scene(tmp_path / "scene")
     _, _, parsed = load(tmp_path / "scene", UserInputs(), ConventionOverrides())
     assert parsed.observations is not None
@@ -207,7 +207,7 @@ def test_other_programs_get_cameras_for_the_pixels_as_they_are_stored(form, plac
     options = ("--pixels", "stored", "--allow-loss")
     result = nerfcli("convert", tmp_path / "scene", tmp_path / place, "--to", form, *options)
     assert result.exit_code == 0, result.stderr
-    assert "3 photos have an EXIF orientation: their cameras refer to pixels as stored" in result.stderr
+    assert "3 photos have an EXIF orientation: the cameras refer to pixels as stored" in result.stderr
     assert farthest_px(capture, load(tmp_path / place, UserInputs(), ConventionOverrides())[2]) < LIMIT_PX
     if form in ("colmap", "colmap-text", "transforms"):
         trained = load_scene(tmp_path)
@@ -287,7 +287,7 @@ def test_a_mask_that_lies_otherwise_is_a_loss(tmp_path):
     """Training turns masks of stored pixels if their shape reveals the turn, which it does not for half a turn."""
     capture = photographed(capture_of([PINHOLE]), tmp_path / "images", {0: 6, 1: 3})
     capture = masked(capture, tmp_path / "masks", 0, 1, 2)
-    with pytest.raises(UserError, match="1 masks of photos with an EXIF orientation"):
+    with pytest.raises(UserError, match="1 mask not turned like the photo"):
         made_scene(capture, tmp_path / "scene")
     made_scene(capture, tmp_path / "scene", allow_loss=True)
     frames = load_scene(tmp_path / "scene").frames

@@ -160,7 +160,7 @@ def test_what_a_model_cannot_hold_is_listed(tmp_path):
     assert losses_colmap_text(capture) == ("6 names with spaces (COLMAP truncates them at the first space)",)
     first = replace(capture.frames[0], mask=tmp_path / "m.png", split="test")
     more = replace(capture, frames=(first, *capture.frames[1:]), unit="metre", depth_bounds=np.tile([1.0, 2.0], (6, 1)))
-    assert losses_colmap(more) == ("1 masks", "the split of 1 frames", "depth bounds", "the unit of length (metre)")
+    assert losses_colmap(more) == ("1 mask", "the split of 1 frame", "depth bounds", "the unit of length (metre)")
 
 
 @pytest.mark.parametrize(

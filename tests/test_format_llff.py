@@ -96,7 +96,7 @@ def test_what_the_array_cannot_hold_is_listed():
         "40 points",
         "colours of 40 points",
         f"{num_observations} observations",
-        "the split of 1 frames",
+        "the split of 1 frame",
     )
 
 

@@ -141,9 +141,9 @@ def test_losses_are_reported(tmp_path):
         "k4 of 1 camera",
         "k6 of 1 camera",
         "the FOV lens of 1 camera",
-        "1 masks",
+        "1 mask",
         "3 observations",
-        "the split of 1 frames",
+        "the split of 1 frame",
         "depth bounds",
         "the unit of length (metre)",
     )

@@ -77,7 +77,7 @@ def test_timestamps_are_the_names_where_these_are_numbers(tmp_path, names, times
 def test_losses_are_reported():
     frame = Frame("000000", CAMERA, np.eye(4), mask=Path("m.png"), split="train")
     capture = Capture((frame,), np.ones((5, 3)), (), None, "x", colours=np.zeros((5, 3), dtype=np.uint8), unit="metre")
-    rest = ("1 masks", "5 points", "colours of 5 points", "the split of 1 frames", "the unit of length (metre)")
+    rest = ("1 mask", "5 points", "colours of 5 points", "the split of 1 frame", "the unit of length (metre)")
     for losses in LOSSES.values():
         assert losses(capture) == ("intrinsics of 1 camera", *rest)
     assert losses_kitti(capture_of(["a"])) == ("intrinsics of 1 camera", "names of 1 frames")

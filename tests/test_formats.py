@@ -204,7 +204,7 @@ def test_malformed_llff_is_refused(tmp_path):
     with pytest.raises(UserError, match="none of its 3 photos is on disk, such as image000"):
         load_scene(tmp_path)
     put(tmp_path, "images/1.jpg", "images_8/1.jpg", "images_8/2.jpg")
-    with pytest.raises(UserError, match="3 rows, but images/ has 1, images_8/ has 2"):
+    with pytest.raises(UserError, match="3 rows, but images/ has 1 photo, images_8/ has 2 photos"):
         load_scene(tmp_path)
     path.write_bytes(path.read_bytes()[:300])
     with pytest.raises(UserError, match=r"poses_bounds\.npy is not a readable NumPy array"):

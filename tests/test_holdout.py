@@ -54,7 +54,7 @@ def test_a_file_lists_names(tmp_path):
     path.write_text("frame_3.png\n\n  frame_5.png \nunplaced.png\n", encoding="utf-8")
     rule = check_holdout(str(path))
     assert names_held_out(rule, NAMES, others=["unplaced.png"]) == {"frame_3.png", "frame_5.png"}
-    with pytest.raises(UserError, match=r"lists 1 names that match no photo: unplaced\.png"):
+    with pytest.raises(UserError, match=r"lists 1 name that matches no photo: unplaced\.png"):
         names_held_out(rule, NAMES)
 
 

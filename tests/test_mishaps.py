@@ -157,7 +157,7 @@ def test_a_run_whose_photos_were_moved_elsewhere_says_which_and_how_to_mend_it(f
 def test_what_a_killed_evaluation_left_goes_with_the_next(finished):
     with subprocess.Popen([sys.executable, "-c", ""]) as dead:
         pass
-    left = finished / f".predictions.partial-{dead.pid}"
+    left = finished / f".predictions.partial-{atomic._host()}-{dead.pid}"
     left.mkdir()
     (left / "half.png").write_bytes(b"half")
     assert nerfcli("evaluate", finished, "--threads", "2").exit_code == 0

@@ -469,7 +469,7 @@ class TestScanNetPp:
             "DSC00001.jpg": ("train", False),
             "DSC00000.jpg": ("test", True),
         }
-        lost = "1 mask left out, which transforms.json names and do not exist: DSC00001.png"
+        lost = "1 mask named in transforms.json left out, not found: DSC00001.png"
         assert capture.notes == (lost, "1 photo marked as bad left out")
 
     def test_undistorted_photos_have_their_own_file(self, tmp_path):

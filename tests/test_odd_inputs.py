@@ -521,7 +521,7 @@ def test_masks_that_are_missing_are_left_out_and_named(tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     capture = parsed(tmp_path)
     assert [frame.mask for frame in capture.frames] == [tmp_path / "masks/0.png", *[None] * (COUNT - 1)]
-    assert capture.notes == ("1 mask left out, which transforms.json names and do not exist: masks/1.png",)
+    assert capture.notes == ("1 mask named in transforms.json left out, not found: masks/1.png",)
 
 
 def test_equal_labels_of_metashape_are_told_apart_by_their_groups(tmp_path):

@@ -18,6 +18,7 @@ import pytest
 import torch
 from fog import fog, foggy_cells
 
+from nerfcli import atomic
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
@@ -162,7 +163,7 @@ def test_a_job_that_is_killed_while_it_replaces_a_folder_ends_the_same(model, tm
         pass
 
     def killed(complete: Path, path: Path) -> None:
-        for source, target in ((path, tmp_path / f".views.old-{dead.pid}"), (complete, path))[:moved]:
+        for source, target in ((path, tmp_path / f".views.old-{atomic._host()}-{dead.pid}"), (complete, path))[:moved]:
             source.rename(target)
         raise SystemExit
 

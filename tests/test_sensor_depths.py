@@ -311,10 +311,10 @@ def test_a_map_turns_like_its_photo_unless_it_is_upright(tmp_path, orientation, 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (np.ones((20, 20)), "is 20x20, of another shape than its photo with 300x200"),
-        (np.ones((2, 20, 30)), "is no depth map: numbers of type float64 in shape"),
+        (np.ones((20, 20)), "is 20x20, which is not the shape of its 300x200 photo"),
+        (np.ones((2, 20, 30)), "is not a depth map: numbers of type float64 in shape"),
         (None, "does not exist"),
-        (b"nothing", "is no depth map: ValueError"),
+        (b"nothing", "is not a depth map: ValueError"),
     ],
 )
 def test_what_is_no_map_of_the_photo_is_an_error(tmp_path, content, message):

@@ -147,11 +147,8 @@ class ObservationEvidence:
         self.name = f"{len(rows)} observations of points in {len(np.unique(self.groups))} photos"
 
     def directions(self, convention: Convention) -> tuple[np.ndarray, ...]:
-        """Return the unit viewing directions of the pixels, (M, 3), and their pixels per radian.
-
-        Observations are in the convention of the file, as its principal points are.
-        """
-        return _directions(self._cameras, self.groups, self._pixels + (0.5 - convention.pixel_centre), convention)
+        """Return the unit viewing directions of the pixels, (M, 3), and their pixels per radian."""
+        return _directions(self._cameras, self.groups, self._pixels, convention)
 
     def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
         """Return the error of each observation, (M,)."""

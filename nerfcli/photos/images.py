@@ -358,10 +358,11 @@ def list_photos(folder: Path, *, subfolders: bool = False) -> Listing:
         read, unread = list_images(each), _unreadable(each)
         pictures += read
         unreadable += unread
-        others = sorted({*each.iterdir()} - {*read, *unread, *(each / name for name in _OURS_OR_SYSTEM)})
+        others = {*each.iterdir()} - {*read, *unread, *(each / name for name in _OURS_OR_SYSTEM)}
         shown = (path for path in others if path.is_file() and not path.name.startswith("."))
         counts.update(path.suffix.lower() or "without a suffix" for path in shown)
-    skipped = ", ".join(f"{count} {suffix}" for suffix, count in counts.most_common())
+    most = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+    skipped = ", ".join(f"{count} {suffix}" for suffix, count in most)
     for paths in (pictures, unreadable):
         paths.sort(key=lambda path: name_in(folder, path))
     return Listing(pictures, unreadable, skipped)

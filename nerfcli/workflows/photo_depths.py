@@ -83,7 +83,9 @@ def depth_errors(run: Run, model: Model, photos: Sequence[DepthMap], *, reporter
         f"errors of depth measured at {100.0 * errors.matched:.1f} % of the pixels of {errors.photos} held-out photos"
     )
     if errors.matched < LEAST_MATCHED:
-        reporter.note("what cannot be matched is usually worse: expect more errors than intervals and confidence say")
+        reporter.note(
+            "what cannot be matched is usually worse: expect larger errors than the intervals and the confidence suggest"
+        )
     return errors
 
 
