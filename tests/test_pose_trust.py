@@ -137,7 +137,7 @@ def test_the_triangulation_angle_is_the_median_of_the_widest_angles_at_points(so
 
 def test_every_rotation_of_a_pair_agrees_with_a_right_result(solved: Solved):
     pairs = read_verified_pairs(solved.job.database, min_matches=30)
-    errors = rotation_errors(solved.model, pairs, seed=0)
+    errors = rotation_errors(solved.model, pairs)
     assert len(errors) > 15
     assert np.median([error.degrees for error in errors]) < 1
     assert max(error.degrees for error in errors) < 6

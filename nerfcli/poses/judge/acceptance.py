@@ -97,7 +97,7 @@ def judge(
     run = (Checks() if checks is None else checks).run
     found: list[PairAgreement] = run("agreement of pairs", lambda: agreements(model, pairs), otherwise=[])
     rotations: list[RotationError] = run(
-        "rotations of pairs", lambda: rotation_errors(model, pairs, seed=solver.seed), otherwise=[]
+        "rotations of pairs", lambda: rotation_errors(model, pairs, solver), otherwise=[]
     )
     contradictions: list[Contradiction] = run(
         "contradictions", lambda: strong_contradictions(model, [*found, *agreements(model, held)]), otherwise=[]

@@ -6,7 +6,9 @@ the observations that contradict it; they are still in the database, and are tes
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from nerfcli.matching.agreement import Agreement, agreement
+from nerfcli.poses.input.job import Solver
 from nerfcli.poses.model.held_out import MOST_ERROR_PX
 from nerfcli.poses.model.projection import Array, panorama_camera, px_per_radian
 
@@ -120,29 +123,36 @@ class RotationError:
     weight: int
 
 
-def rotation_errors(model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], *, seed: int) -> list[RotationError]:
+def rotation_errors(
+    model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], solver: Solver = Solver()
+) -> list[RotationError]:
     """Compare relative rotations from the matches of two photos alone, with the model's intrinsics, with the model's.
 
     Only the pairs with the most matches of each photo are used, and only if they have parallax: without it, the
     five-point algorithm may turn a camera around.
     """
+    chosen = strongest(placed_pairs(model, pairs), per_photo=4)
+    with ThreadPoolExecutor(solver.threads) as pool:
+        errors = pool.map(partial(_rotation_error, model, seed=solver.seed), chosen)
+        return [error for error in errors if error is not None]
+
+
+def _rotation_error(model: pycolmap.Reconstruction, pair: VerifiedPair, *, seed: int) -> RotationError | None:
+    """Compare a pair's own relative rotation with the model's; None without one, or without parallax."""
     # The matches are verified; few trials are enough, and pycolmap's own number takes ten times as long.
     options = pycolmap.RANSACOptions(max_error=MOST_ERROR_PX, min_num_trials=50, max_num_trials=500, random_seed=seed)
-    errors = []
-    for pair in strongest(placed_pairs(model, pairs), per_photo=4):
-        cameras = _cameras(model, pair)
-        step = max(1, pair.matches // _MOST_FOR_ROTATION)
-        one, other = pair.pixels_one[::step], pair.pixels_other[::step]
-        found = pycolmap.estimate_relative_pose(cameras[0], one, cameras[1], other, options=options)
-        if found is None:
-            continue
-        own, inliers = found["cam2_from_cam1"], np.asarray(found["inlier_mask"])
-        parallax = _compared(cameras, (one[inliers], other[inliers]), own).parallax
-        if not len(parallax) or np.degrees(np.nanmedian(parallax)) < LEAST_ANGLE_DEG:
-            continue
-        degrees = float(np.degrees((own.rotation * _other_from_one(model, pair).rotation.inverse()).angle()))
-        errors.append(RotationError(degrees, step * int(inliers.sum())))
-    return errors
+    cameras = _cameras(model, pair)
+    step = max(1, pair.matches // _MOST_FOR_ROTATION)
+    one, other = pair.pixels_one[::step], pair.pixels_other[::step]
+    found = pycolmap.estimate_relative_pose(cameras[0], one, cameras[1], other, options=options)
+    if found is None:
+        return None
+    own, inliers = found["cam2_from_cam1"], np.asarray(found["inlier_mask"])
+    parallax = _compared(cameras, (one[inliers], other[inliers]), own).parallax
+    if not len(parallax) or np.degrees(np.nanmedian(parallax)) < LEAST_ANGLE_DEG:
+        return None
+    degrees = float(np.degrees((own.rotation * _other_from_one(model, pair).rotation.inverse()).angle()))
+    return RotationError(degrees, step * int(inliers.sum()))
 
 
 def panorama_inliers(
