@@ -18,7 +18,7 @@ from nerfcli.poses.input.job import Job
 from nerfcli.poses.judge.contradictions import leave_out_contradicting
 from nerfcli.poses.model import locate
 from nerfcli.poses.model.locate import LocationAttempt, left_out, locate_photos, shared_pairs
-from nerfcli.poses.model.point_descriptors import KnownPoints, PhotoFeatures
+from nerfcli.poses.model.point_descriptors import KnownPoints, PhotoFeatures, known_points, photo_features, votes
 
 POINTS = synthetic.boulder(700, seed=0)
 VIEWS = synthetic.ring(7, [WIDE], seed=0, turn_deg=180)
@@ -131,7 +131,6 @@ def test_only_a_photo_that_resembles_a_placed_one_is_tried_again(tmp_path: Path,
     job = synthetic.synthetic_job(tmp_path / "three", views, seed=0)
     shutil.copy(tmp_path / "database.db", job.database)
     tried: list[int] = []
-    votes = locate.votes
 
     def counted(photo: PhotoFeatures, model_points: KnownPoints) -> tuple[np.ndarray, np.ndarray]:
         tried.append(photo.image_id)
@@ -141,6 +140,26 @@ def test_only_a_photo_that_resembles_a_placed_one_is_tried_again(tmp_path: Path,
     _, attempts = locate_photos(model, job, image_ids=[LAST, LAST + 1, LAST + 2])
     assert [attempt.refused == "" for attempt in attempts] == [True, False, False]
     assert tried == [LAST, LAST + 1, LAST + 2, LAST + 2]
+
+
+def test_a_feature_votes_for_a_point_that_it_resembles_clearly_more_than_any_other(tmp_path: Path):
+    """Independent: a loop over features, with the largest cosine of each point."""
+    model, job = capture(tmp_path, shown(VIEWS[3]))
+    with pycolmap.Database.open(str(job.database)) as database:
+        known = known_points(model, database)
+        photo = photo_features(model, database, LAST)
+    assert photo is not None
+    best: dict[int, tuple[float, int]] = {}
+    for feature, descriptor in enumerate(photo.descriptors):
+        cosines = np.full(len(known.ids), -1.0)
+        np.maximum.at(cosines, known.of, known.descriptors @ descriptor)
+        other, nearest = np.argsort(cosines)[-2:]
+        ratio = np.sqrt(max(1 - cosines[nearest], 0) / (1 - cosines[other]))
+        if ratio < min(0.9, best.get(nearest, (1.0, 0))[0]):
+            best[nearest] = (ratio, feature)
+    features, points = votes(photo, known)
+    assert len(features) > 100
+    assert dict(zip(points, features, strict=True)) == {point: feature for point, (_, feature) in best.items()}
 
 
 def test_nothing_is_placed_without_a_known_lens(tmp_path: Path):

@@ -23,7 +23,7 @@ BLOCK = 256
 class KnownPoints:
     """A model's points: ids (points,), positions `places` (points, 3), and descriptors of length 1.
 
-    of: (descriptors,) index of the point. photos: (descriptors,) id of the image.
+    of: (descriptors,) index of the point, ascending. photos: (descriptors,) id of the image.
     """
 
     ids: Indices
@@ -59,12 +59,14 @@ def known_points(model: pycolmap.Reconstruction, database: pycolmap.Database) ->
             numbers.append(element.point2D_idx)
             points.append(index)
     photos = sorted(features)
+    of = np.concatenate([np.array(features[photo][1], dtype=np.int64) for photo in photos])
+    order = np.argsort(of, kind="stable")
     return KnownPoints(
         ids,
         np.array([model.point3D(int(point_id)).xyz for point_id in ids]).reshape(-1, 3),
-        np.concatenate([_descriptors(database, photo)[features[photo][0]] for photo in photos]),
-        np.concatenate([np.array(features[photo][1], dtype=np.int64) for photo in photos]),
-        np.repeat(np.array(photos, dtype=np.int64), [len(features[photo][1]) for photo in photos]),
+        np.concatenate([_descriptors(database, photo)[features[photo][0]] for photo in photos])[order],
+        of[order],
+        np.repeat(np.array(photos, dtype=np.int64), [len(features[photo][1]) for photo in photos])[order],
     )
 
 
@@ -93,16 +95,18 @@ def resembling(photo: PhotoFeatures, descriptors: NDArray[np.float32]) -> int:
 def votes(photo: PhotoFeatures, model_points: KnownPoints) -> tuple[Indices, Indices]:
     """Return features and the points that they vote for, each point once."""
     nearest = np.empty(len(photo.pixels), dtype=np.int64)
-    ratios, cosines = np.empty(len(nearest)), np.empty(len(nearest))
+    ratios = np.empty(len(nearest))
     for start in range(0, len(nearest), BLOCK):
         alike = photo.descriptors[start : start + BLOCK] @ model_points.descriptors.T  # (block, descriptors)
         rows = np.arange(len(alike))
         best = alike.argmax(axis=1)
         points, cosine = model_points.of[best], alike[rows, best]
-        alike[model_points.of[None, :] == points[:, None]] = -1.0
+        own = (np.searchsorted(model_points.of, points, side=side) for side in ("left", "right"))
+        for row, first, end in zip(alike, *own, strict=True):
+            row[first:end] = -1.0
         second = alike.max(axis=1)
         block = slice(start, start + len(alike))
-        nearest[block], cosines[block] = points, cosine
+        nearest[block] = points
         ratios[block] = np.sqrt(np.maximum(2 - 2 * cosine, 0) / np.maximum(2 - 2 * second, 1e-12))
     features = np.flatnonzero(ratios < _RATIO)
     features = features[np.argsort(ratios[features], kind="stable")]
