@@ -67,7 +67,7 @@ def likeness(descriptors: Sequence[np.ndarray], report: Report) -> np.ndarray:
     for photo, rows in enumerate(descriptors):
         sizes[photo, len(rows) :] = np.inf
     shared = np.zeros((count, count), np.int64)
-    block = 64  # other photos compared at a time: some tens of megabytes
+    block = 8  # other photos compared at a time: their distances stay in the processor's cache
     for i in range(count):
         report("pair", i, count)
         for start in range(i + 1, count, block):

@@ -121,7 +121,7 @@ def _searched_pixels(sizes: Iterable[tuple[int, int]], *, max_image_size: int) -
 
 def retrieval_seconds(photos: int) -> float:
     """Estimate the CPU seconds to find look-alikes among this many photos."""
-    return math.comb(photos, 2) * 0.0006 * (retrieval_feature_count(photos) / 256) ** 2
+    return math.comb(photos, 2) * 0.0003 * (retrieval_feature_count(photos) / 256) ** 2
 
 
 def matching_seconds(pairs: int, *, max_features: int) -> float:
