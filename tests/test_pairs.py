@@ -448,6 +448,21 @@ def test_another_attempt_is_measured_from_its_own_start():
     assert 60.0 < outlook.update("map", 3, 100)[1] < 300.0
 
 
+def test_another_attempt_does_not_count_single_photos_of_the_first_again():
+    """Closed form: the last of ten photos, of 10 s of mapping, and checks of 2 s are left, and no trials."""
+    now = 0.0
+    outlook = TimeEstimate(Plan(10, 1600, 4096, "exhaustive", 45, {"map": 10.0, "check": 2.0}), clock=lambda: now)
+    outlook.update("map", 0, 10)
+    now = 10.0
+    outlook.update("map", 10, 10)
+    outlook.update("locate", 0, 20)
+    now = 24.0
+    outlook.update("check", 0, 4)
+    now = 26.0
+    outlook.update("check", 4, 4)
+    assert outlook.update("map", 9, 10)[1] == pytest.approx(10.0 * (1 - 0.9**1.3) + 2.0)
+
+
 def test_another_attempt_lowers_the_share():
     """Mapping begins again after the checks: the work is not at its end."""
     now = 0.0

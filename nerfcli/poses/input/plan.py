@@ -203,6 +203,8 @@ class TimeEstimate:
         place = _ORDER.index(stage) if stage in _ORDER else len(_ORDER)
         if (place, ratio) < (self._place, self._ratio):  # the work has gone back for another attempt
             self._fraction = 0.0
+            # Whether it needs these again is not known yet.
+            self._seconds |= {name: 0.0 for name in ("merge", "locate", "settle") if name != stage}
         if stage != self._stage or ratio < self._ratio:
             took, of_plan = self._latest
             if of_plan > _telling(self._stage) * self._seconds.get(self._stage, 0.0):
