@@ -83,9 +83,7 @@ def depth_errors(run: Run, model: Model, photos: Sequence[DepthMap], *, reporter
         f"errors of depth measured at {100.0 * errors.matched:.1f} % of the pixels of {errors.photos} held-out photos"
     )
     if errors.matched < LEAST_MATCHED:
-        reporter.note(
-            "what cannot be matched is usually worse: expect larger errors than the intervals and the confidence suggest"
-        )
+        reporter.note("what cannot be matched is usually worse: expect larger errors than intervals and confidence say")
     return errors
 
 
