@@ -321,13 +321,13 @@ def render(
 
     views, usual, console = seen.views(), files.settings(depths, seen.cameras), printing.console
     _refuse_unused(seen, depths, files, usual.outputs)
+    of_fields = {"--step": files.step != 1.0, "--check-accuracy": files.check_accuracy}
     if splats is not None:
-        _refuse_of_runs(splats, {"--step": files.step != 1.0, "--check-accuracy": files.check_accuracy})
+        _refuse_of_runs(splats, of_fields)
 
     def work(given: Given) -> None:
         path, how = given.path, {"views": views, "settings": usual, "resources": computing.resources}
         if path.suffix.lower() in SUFFIXES:
-            of_fields = {"--step": files.step != 1.0, "--check-accuracy": files.check_accuracy}
             _refuse_of_runs(path, {"--cameras-only": seen.cameras_only, "--splats": splats is not None, **of_fields})
             with console.stage(f"render {views.name}") as reporter:
                 output = writing.inside(replace(given, path=path.with_suffix("")), "")

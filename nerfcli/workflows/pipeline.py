@@ -110,58 +110,88 @@ def run_pipeline(
             resources=resources,
             reporter=stage,
         )
-    usual, field = Output(overwrite=again), run.checkpoint_sha256()
-
-    def replacing(file: Path, key: str, made_from: str | None) -> Output:
-        """Return the output of a result that is described in a file: one of an earlier field is replaced."""
-        made = None
-        if file.is_file():
-            with suppress(UserError):
-                made = read_json(file, needed=(key,), hint="")[key]
-        return Output(overwrite=again or made not in (None, made_from))
-
-    with reporter.stage("evaluate") as stage:
-        output_of_metrics = replacing(run.metrics_path, "checkpoint_sha256", field)
-        evaluation = evaluate_run(run.path, output_of_metrics, resources=resources, reporter=stage)
-    for result in (run.path, evaluation) if capture else (scene, run.path, evaluation):
-        show(result)
-
+    results = _Results(run, again, resources, reporter, show)
+    if capture is None:
+        show(scene)
+    show(run.path)
+    evaluation = results.metrics()
     splats = of_splats = None
     if any(frame.camera.is_spherical for frame in run.cameras.train):
         reporter.note("360-degree photos have no splats; the video is made from the field")
     else:
-        splats = default_target(run.path, "splats")
-        is_old = splats.exists() and not are_of(splats, run)
-        if again or is_old or not splats.exists():
-            seconds = (settings.budget_seconds or 2 * SplatSettings.budget_seconds) / 2
-            half = SplatSettings(budget_seconds=seconds, resume=None)
-            with reporter.stage("export splats") as stage:
-                replaced = Output(overwrite=again or is_old)
-                export_run(run.path, replaced, to="splats", splats=half, resources=resources, reporter=stage)
-        with reporter.stage("evaluate splats") as stage:
-            file = run.path / f"metrics-{splats.name}.json"
-            replaced = replacing(file, "checkpoint_sha256", file_digest(splats))
-            of_splats = evaluate_splats(run.path, splats, replaced, resources=resources, reporter=stage)
-        for result in (of_splats, splats):
-            show(result)
+        seconds = (settings.budget_seconds or 2 * SplatSettings.budget_seconds) / 2
+        splats, of_splats = results.splats(SplatSettings(budget_seconds=seconds, resume=None))
+    renders = results.pictures(Views("test"), ExportSettings(OUTPUTS[:3], usual_depth(run, Views("test"))))
+    orbit = ExportSettings(OUTPUTS[:2], usual_depth(run, Views("orbit")), video=VideoSettings())
+    renders += results.pictures(Views("orbit"), orbit, splats=splats)
+    return PipelineResult(scene, run, evaluation, splats, of_splats, renders, results.report())
 
-    renders = []
-    for views, outputs, shown in ((Views("test"), OUTPUTS[:3], None), (Views("orbit"), OUTPUTS[:2], splats)):
-        video = VideoSettings() if views.cameras == "orbit" else None
-        wanted = ExportSettings(outputs, usual_depth(run, views), video=video)
-        folder = run.path / RENDERS / folder_name(views, wanted, of_splats=shown is not None)
-        replaced = replacing(folder / DESCRIPTION, "field_sha256", field)
-        with reporter.stage(f"render {views.name}") as stage:
-            written = render_run(
-                run.path, replaced, views=views, settings=wanted, splats=shown, resources=resources, reporter=stage
-            )
+
+@dataclass(frozen=True)
+class _Results:
+    """What is made from a trained field, stage by stage. Results of an earlier field are replaced.
+
+    Args:
+        run: the field.
+        again: whether everything is replaced.
+        resources, reporter, show: see `run_pipeline`.
+    """
+
+    run: Run
+    again: bool
+    resources: Resources
+    reporter: Reporter
+    show: Callable[[Path | Evaluation], None]
+
+    def metrics(self) -> Evaluation:
+        """Evaluate the field."""
+        output = self._replacing(self.run.metrics_path, "checkpoint_sha256", self.run.checkpoint_sha256())
+        with self.reporter.stage("evaluate") as stage:
+            evaluation = evaluate_run(self.run.path, output, resources=self.resources, reporter=stage)
+        self.show(evaluation)
+        return evaluation
+
+    def splats(self, settings: SplatSettings) -> tuple[Path, Evaluation]:
+        """Export splats of the field as .ply, and evaluate them."""
+        run, splats = self.run.path, default_target(self.run.path, "splats")
+        is_old = splats.exists() and not are_of(splats, self.run)
+        if self.again or is_old or not splats.exists():
+            output = Output(overwrite=self.again or is_old)
+            with self.reporter.stage("export splats") as stage:
+                export_run(run, output, to="splats", splats=settings, resources=self.resources, reporter=stage)
+        output = self._replacing(run / f"metrics-{splats.name}.json", "checkpoint_sha256", file_digest(splats))
+        with self.reporter.stage("evaluate splats") as stage:
+            evaluation = evaluate_splats(run, splats, output, resources=self.resources, reporter=stage)
+        self.show(evaluation)
+        self.show(splats)
+        return splats, evaluation
+
+    def pictures(self, views: Views, settings: ExportSettings, *, splats: Path | None = None) -> list[Path]:
+        """Render views of the splats, or else of the field."""
+        run, name = self.run.path, folder_name(views, settings, of_splats=splats is not None)
+        output = self._replacing(run / RENDERS / name / DESCRIPTION, "field_sha256", self.run.checkpoint_sha256())
+        what = {"views": views, "settings": settings, "splats": splats}
+        with self.reporter.stage(f"render {views.name}") as stage:
+            written = render_run(run, output, **what, resources=self.resources, reporter=stage)
         for path in written:
-            show(path)
-        renders += written
-    with reporter.stage("report") as stage:
-        report = report_runs([run.path], usual, keep=True, resources=resources, reporter=stage)
-    show(report)
-    return PipelineResult(scene, run, evaluation, splats, of_splats, renders, report)
+            self.show(path)
+        return written
+
+    def report(self) -> Path:
+        """Write the page about the run."""
+        output = Output(overwrite=self.again)
+        with self.reporter.stage("report") as stage:
+            report = report_runs([self.run.path], output, keep=True, resources=self.resources, reporter=stage)
+        self.show(report)
+        return report
+
+    def _replacing(self, file: Path, key: str, made_from: str | None) -> Output:
+        """Return the output of a result that a JSON file describes: one made from something else is replaced."""
+        made = None
+        if file.is_file():
+            with suppress(UserError):
+                made = read_json(file, needed=(key,), hint="")[key]
+        return Output(overwrite=self.again or made not in (None, made_from))
 
 
 def _refuse_unused(photos: Path, poses: PoseSettings, *, frames: int | None, intrinsics: Path | None) -> None:
