@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfcli.render.files.depth_pictures import DepthMeta
+from nerfcli.render.files.depth_meta import DepthMeta
 from nerfcli.render.files.float_maps import write_exr, write_npy, write_png16, write_tiff
 
 META = DepthMeta("conditional", "ray", "arbitrary", 0.5)

@@ -20,7 +20,7 @@ from PIL import Image
 
 from nerfcli.errors import UserError
 from nerfcli.photos.colours import linear_light
-from nerfcli.render.files.depth_pictures import DepthMeta, difference_of
+from nerfcli.render.files.depth_meta import DepthMeta, difference_of
 from nerfcli.render.files.file_facts import depth_meta_of
 from nerfcli.render.files.float_maps import (
     LARGEST_LEVEL,

@@ -23,11 +23,11 @@ from nerfcli.photos.colours import linear_light
 from nerfcli.photos.images import read_image
 from nerfcli.render.depth import effective_floor
 from nerfcli.render.files.depth_files import Levels, map_path, read_map, write_levels, write_maps
-from nerfcli.render.files.depth_pictures import DepthMeta
+from nerfcli.render.files.depth_meta import DepthMeta
 from nerfcli.render.files.file_facts import depth_meta_of
 from nerfcli.render.files.float_maps import read_tiff, write_tiff
 from nerfcli.render.frames import render_job
-from nerfcli.render.job import MEASURED, ExportSettings, RenderJob, VideoSettings, depth_meta, file_names, floor_of
+from nerfcli.render.job import MEASURED, RenderJob, RenderSettings, VideoSettings, depth_meta, file_names, floor_of
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import DepthRequest, RenderedPicture, render_picture
 from nerfcli.render.presentation import preview, value_range
@@ -54,7 +54,7 @@ def model() -> Model:
 
 def order(frames: list[Frame], *, outputs: tuple[str, ...] = ("rgb", "depth", "opacity"), **settings: Any) -> RenderJob:
     wanted: dict[str, Any] = {"depth": DEPTH} | settings
-    return RenderJob(tuple(frames), ExportSettings(outputs=outputs, **wanted), {"run": "a run"})
+    return RenderJob(tuple(frames), RenderSettings(outputs=outputs, **wanted), {"run": "a run"})
 
 
 def export(model: Model, frames: list[Frame], folder: Path, **settings: Any) -> list[Path]:
@@ -64,7 +64,7 @@ def export(model: Model, frames: list[Frame], folder: Path, **settings: Any) -> 
 
 def ordered(frames: list[Frame], **settings: Any) -> RenderJob:
     wanted: dict[str, Any] = {"outputs": OUTPUTS, "depth": DEPTH} | settings
-    return RenderJob(tuple(frames), ExportSettings(**wanted), {"run": "a run", "field_sha256": "ab"})
+    return RenderJob(tuple(frames), RenderSettings(**wanted), {"run": "a run", "field_sha256": "ab"})
 
 
 def noted(model: Model, order: RenderJob, folder: Path) -> list[str]:

@@ -18,7 +18,7 @@ from test_every_format import VIEWS
 
 from nerfcli.cli.info import lines_of
 from nerfcli.photos.images import write_png
-from nerfcli.render.files.depth_pictures import KEY
+from nerfcli.render.files.depth_meta import KEY
 from nerfcli.render.files.file_facts import NOT_STATED, RENDERS, description_of
 from nerfcli.render.files.float_maps import write_exr, write_png16
 from nerfcli.splats.files import write_splats

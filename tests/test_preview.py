@@ -11,7 +11,7 @@ from matplotlib import colormaps
 
 from nerfcli.photos.colours import COLOUR_MAPS
 from nerfcli.render.files.depth_files import quantiles
-from nerfcli.render.files.depth_pictures import DepthMeta
+from nerfcli.render.files.depth_meta import DepthMeta
 from nerfcli.render.presentation import ColourRange, coloured, preview
 
 META = DepthMeta("conditional", "ray", "arbitrary", 0.5)

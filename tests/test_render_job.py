@@ -30,7 +30,7 @@ from nerfcli.render import frames as rendering
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.files.file_facts import description_of
 from nerfcli.render.frames import render_job
-from nerfcli.render.job import ExportSettings, RenderJob, VideoSettings
+from nerfcli.render.job import RenderJob, RenderSettings, VideoSettings
 from nerfcli.render.model import Model
 
 # A gif, since the other encoders do not promise the same bytes for the same frames.
@@ -53,7 +53,7 @@ def job_of(count: int = 4, *, convention: str = "conditional", video: VideoSetti
     ]
     frames = tuple(Frame(f"f{index}/v.png", Camera.pinhole(10, 8, 8.0), pose) for index, pose in enumerate(poses))
     depth = DepthRequest(convention, "z", min_opacity=0.1)
-    return RenderJob(frames, ExportSettings(("rgb", "depth"), depth, video=video), {"run": "a run"})
+    return RenderJob(frames, RenderSettings(("rgb", "depth"), depth, video=video), {"run": "a run"})
 
 
 def reporting(on_frames: Callable[[float], None], *, notes: list[str] | None = None) -> Reporter:

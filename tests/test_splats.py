@@ -23,7 +23,7 @@ from nerfcli.kernels.numba_cpu.splats import render_splats
 from nerfcli.photos.images import read_image
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.depth import DepthRequest
-from nerfcli.render.job import ExportSettings
+from nerfcli.render.job import RenderSettings
 from nerfcli.splats import refine as refinement
 from nerfcli.splats.gaussians import Gaussians, gaussians_of, rows_of
 from nerfcli.splats.refine import Refinement, load_splat_state, refine, splat_photos
@@ -251,7 +251,7 @@ def test_splats_are_measured_by_the_protocol_of_fields(run: Path) -> None:
     found = evaluate_splats(run, ply)
     name = found.metrics.images[0].name
     folder = nerfcli.render_run(
-        run, splats=ply, settings=ExportSettings(("rgb",), DepthRequest("median", "z"), rgba=False)
+        run, splats=ply, settings=RenderSettings(("rgb",), DepthRequest("median", "z"), rgba=False)
     )
     assert folder[0].parent.name == "test-splats"
     shown = read_image(next(folder[0].rglob(f"{Path(name).stem}.png")))
@@ -265,7 +265,7 @@ def test_splats_are_measured_by_the_protocol_of_fields(run: Path) -> None:
 def test_foreign_splats_are_rendered_with_the_cameras_of_a_file(run: Path, tmp_path: Path) -> None:
     """The pictures are those of `SplatScene`; cameras of a run and photos are refused in two lines."""
     ply = shutil.copy(run.with_name("b.ply"), tmp_path / "b.ply")
-    settings = ExportSettings(("rgb", "depth"), DepthRequest("median", "z"))
+    settings = RenderSettings(("rgb", "depth"), DepthRequest("median", "z"))
     rgb, _ = render_file(ply, views=Views(str(run / "cameras.json")), settings=settings)
     assert rgb == tmp_path / "b-renders" / "cameras-median-z" / "rgb"
     frame = nerfcli.load_run(run).cameras.test[0]

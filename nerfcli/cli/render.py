@@ -13,7 +13,7 @@ from nerfcli.cli.options import Computing, Printing, Writing, finite, one_of, re
 
 if TYPE_CHECKING:
     from nerfcli.render.depth import DepthRequest
-    from nerfcli.render.job import ExportSettings, VideoSettings
+    from nerfcli.render.job import RenderSettings, VideoSettings
     from nerfcli.workflows.views import PictureOptions, Views
 
 
@@ -207,18 +207,18 @@ class FileOptions:
         """Whether videos are written."""
         return self.video or self.video_format is not None
 
-    def settings(self, depth: DepthOptions, cameras: str) -> "ExportSettings":
+    def settings(self, depth: DepthOptions, cameras: str) -> "RenderSettings":
         """Return the settings that the options select.
 
         Raises:
             typer.BadParameter: a value is unknown, or two exclude each other.
         """
-        from nerfcli.render.job import OUTPUTS, ExportSettings
+        from nerfcli.render.job import OUTPUTS, RenderSettings
 
         outputs = some_of(self.outputs, OUTPUTS, "--outputs")
         request = depth.request(outputs)
         finite(self.step, "--step")
-        return ExportSettings(
+        return RenderSettings(
             outputs,
             request,
             self._formats(outputs, depth.depth),

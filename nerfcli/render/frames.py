@@ -36,10 +36,10 @@ from nerfcli.render.coverage import with_coverage
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.depth_errors import DepthErrors
 from nerfcli.render.files.depth_files import frame_meta, write_levels, write_maps
-from nerfcli.render.files.depth_pictures import DepthMeta, limits_in_words
+from nerfcli.render.files.depth_meta import DepthMeta, limits_in_words
 from nerfcli.render.files.file_facts import RENDERS
 from nerfcli.render.files.float_maps import scale_in_words
-from nerfcli.render.job import BLACK, ExportSettings, RenderJob, depth_meta, with_suffix
+from nerfcli.render.job import BLACK, RenderJob, RenderSettings, depth_meta, with_suffix
 from nerfcli.render.pictures import Renderable, RenderedPicture, straight_rgba
 from nerfcli.render.presentation import write_previews, write_videos
 from nerfcli.render.tracing import TOLERANCE
@@ -302,7 +302,7 @@ def _write_outputs(
     folder: Path,
     name: str,
     *,
-    settings: ExportSettings,
+    settings: RenderSettings,
     meta: DepthMeta,
     background: Background,
 ) -> None:

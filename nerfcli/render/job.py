@@ -18,7 +18,7 @@ from nerfcli.render import depth_errors
 from nerfcli.render.coverage import DepthMap
 from nerfcli.render.depth import MEDIAN, DepthRequest, effective_floor
 from nerfcli.render.depth_errors import DepthErrors
-from nerfcli.render.files.depth_pictures import CONVENTION_OF, QUANTITIES, DepthMeta
+from nerfcli.render.files.depth_meta import CONVENTION_OF, QUANTITIES, DepthMeta
 from nerfcli.render.files.file_facts import RENDERS
 from nerfcli.render.files.film import ENCODERS, check_encoders
 from nerfcli.render.pictures import Renderable
@@ -49,8 +49,8 @@ class VideoSettings:
 
 
 @dataclass(frozen=True)
-class ExportSettings:
-    """Settings of an export.
+class RenderSettings:
+    """Settings of a rendering.
 
     Args:
         outputs: some of `OUTPUTS`.
@@ -185,13 +185,13 @@ class RenderJob:
     Args:
         frames: cameras and poses in the scene's frame.
         provenance: all else that determines the pictures, such as the run and the hash of its field; plain values.
-        photo_depths: depth maps of the training photos, if `ExportSettings.needs_visibility`; the provenance names the
+        photo_depths: depth maps of the training photos, if `RenderSettings.needs_visibility`; the provenance names the
             photos.
-        depth_errors: measured depth errors of the field, if `ExportSettings.needs_errors`.
+        depth_errors: measured depth errors of the field, if `RenderSettings.needs_errors`.
     """
 
     frames: tuple[Frame, ...]
-    settings: ExportSettings
+    settings: RenderSettings
     provenance: dict[str, Any]
     photo_depths: tuple[DepthMap, ...] = ()
     depth_errors: DepthErrors | None = None

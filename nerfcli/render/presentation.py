@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from nerfcli.photos.colours import levels_of
 from nerfcli.photos.images import read_image, write_png
 from nerfcli.render.files.depth_files import quantiles, read_map
-from nerfcli.render.files.depth_pictures import AXES, KEY, UNIT_OF, DepthMeta
+from nerfcli.render.files.depth_meta import AXES, KEY, UNIT_OF, DepthMeta
 from nerfcli.render.files.film import write_video
 from nerfcli.render.job import MEASURED, RenderJob, meaning_of
 from nerfcli.version import __version__

@@ -15,7 +15,7 @@ from nerfcli.notices import Reporter
 from nerfcli.output import Output, beside
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.render.files.file_facts import RENDERS as DESCRIPTION
-from nerfcli.render.job import OUTPUTS, ExportSettings, VideoSettings
+from nerfcli.render.job import OUTPUTS, RenderSettings, VideoSettings
 from nerfcli.training.runs.run import Run
 from nerfcli.training.runs.settings import TrainSettings, sizes_for
 from nerfcli.workflows.evaluate import Evaluation, evaluate_run, evaluate_splats
@@ -121,8 +121,8 @@ def run_pipeline(
     else:
         seconds = (settings.budget_seconds or 2 * SplatSettings.budget_seconds) / 2
         splats, of_splats = results.splats(SplatSettings(budget_seconds=seconds, resume=None))
-    renders = results.pictures(Views("test"), ExportSettings(OUTPUTS[:3], usual_depth(run, Views("test"))))
-    orbit = ExportSettings(OUTPUTS[:2], usual_depth(run, Views("orbit")), video=VideoSettings())
+    renders = results.pictures(Views("test"), RenderSettings(OUTPUTS[:3], usual_depth(run, Views("test"))))
+    orbit = RenderSettings(OUTPUTS[:2], usual_depth(run, Views("orbit")), video=VideoSettings())
     renders += results.pictures(Views("orbit"), orbit, splats=splats)
     return PipelineResult(scene, run, evaluation, splats, of_splats, renders, results.report())
 
@@ -166,7 +166,7 @@ class _Results:
         self.show(splats)
         return splats, evaluation
 
-    def pictures(self, views: Views, settings: ExportSettings, *, splats: Path | None = None) -> list[Path]:
+    def pictures(self, views: Views, settings: RenderSettings, *, splats: Path | None = None) -> list[Path]:
         """Render views of the splats, or else of the field."""
         run, name = self.run.path, folder_name(views, settings, of_splats=splats is not None)
         output = self._replacing(run / RENDERS / name / DESCRIPTION, "field_sha256", self.run.checkpoint_sha256())

@@ -15,7 +15,7 @@ from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
 from nerfcli.output import Output
 from nerfcli.render.frames import render_job
-from nerfcli.render.job import OUTPUTS, ExportSettings, RenderJob
+from nerfcli.render.job import OUTPUTS, RenderJob, RenderSettings
 from nerfcli.render.model import Model
 from nerfcli.splats.render import SplatScene
 from nerfcli.training.runs.run import Run, load_run
@@ -34,15 +34,15 @@ RENDERS = "renders"
 HELD_OUT = Views("test")
 
 
-def folder_name(views: Views, settings: ExportSettings, *, of_splats: bool = False) -> str:
+def folder_name(views: Views, settings: RenderSettings, *, of_splats: bool = False) -> str:
     """Return the name of the folder in RUN/renders: the views and, so that conventions never mix, the kind of depth."""
     depth = f"-{settings.depth.convention.replace(':', '-')}-{settings.depth.axis}" if settings.measured else ""
     return f"{views.name}{depth}{'-splats' if of_splats else ''}"
 
 
-def usual_settings(run: Run, views: Views) -> ExportSettings:
+def usual_settings(run: Run, views: Views) -> RenderSettings:
     """Return the settings of colours, depths and opacities, as `nerfcli render` writes them by default."""
-    return ExportSettings(outputs=OUTPUTS[:3], depth=usual_depth(run, views))
+    return RenderSettings(outputs=OUTPUTS[:3], depth=usual_depth(run, views))
 
 
 def render_run(
@@ -50,7 +50,7 @@ def render_run(
     output: Output = Output(),
     *,
     views: Views = HELD_OUT,
-    settings: ExportSettings | None = None,
+    settings: RenderSettings | None = None,
     splats: str | Path | None = None,
     resources: Resources = Resources(),
     reporter: Reporter = Reporter(),
@@ -115,7 +115,7 @@ def render_splats(
     output: Output = Output(),
     *,
     views: Views,
-    settings: ExportSettings,
+    settings: RenderSettings,
     resources: Resources = Resources(),
     reporter: Reporter = Reporter(),
 ) -> list[Path]:

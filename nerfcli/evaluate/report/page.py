@@ -36,7 +36,7 @@ from nerfcli.pages import figures, page
 from nerfcli.pages.page import data_uri, fitted, jpeg_bytes
 from nerfcli.photos.colours import levels_of
 from nerfcli.render.depth import DepthRequest
-from nerfcli.render.files.depth_pictures import DepthMeta
+from nerfcli.render.files.depth_meta import DepthMeta
 from nerfcli.render.presentation import ColourRange, coloured
 from nerfcli.version import __version__
 

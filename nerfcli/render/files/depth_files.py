@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.render.files.depth_pictures import DepthMeta, difference_of, mixed
+from nerfcli.render.files.depth_meta import DepthMeta, difference_of, mixed
 from nerfcli.render.files.file_facts import depth_meta_of
 from nerfcli.render.files.float_maps import (
     CHANNELS,
@@ -26,7 +26,7 @@ from nerfcli.render.files.float_maps import (
     write_png16,
     write_tiff,
 )
-from nerfcli.render.job import EXR_FOLDER, FLOAT_FORMATS, LEVELS_FOLDER, ExportSettings, meaning_of, with_suffix
+from nerfcli.render.job import EXR_FOLDER, FLOAT_FORMATS, LEVELS_FOLDER, RenderSettings, meaning_of, with_suffix
 from nerfcli.render.pictures import RenderedPicture
 
 _AXES_OF_VIEW = "OpenCV: +x right, +y down, +z forward; the top-left pixel's centre is (0.5, 0.5)"
@@ -52,7 +52,7 @@ def frame_meta(
     return replace(meta, view=view, provenance=dict(provenance), error_bounds=dict(error_bounds))
 
 
-def write_maps(picture: RenderedPicture, folder: Path, name: str, *, settings: ExportSettings, meta: DepthMeta) -> None:
+def write_maps(picture: RenderedPicture, folder: Path, name: str, *, settings: RenderSettings, meta: DepthMeta) -> None:
     """Write the maps of a picture in the float formats of `settings`; each file atomically.
 
     Args:

@@ -21,7 +21,7 @@ from PIL import Image
 
 from nerfcli.errors import UserError
 from nerfcli.photos.video import ffmpeg_program
-from nerfcli.render.files.depth_pictures import FORMAT, KEY, DepthMeta, entries_of_text
+from nerfcli.render.files.depth_meta import FORMAT, KEY, DepthMeta, entries_of_text
 from nerfcli.render.files.float_maps import CHANNELS, depth_of_levels, read_any_tiff, read_exr, read_npy
 
 VIDEO_SUFFIXES = (".mp4", ".webm", ".mkv", ".mov", ".gif")

@@ -26,7 +26,7 @@ from PIL.PngImagePlugin import PngInfo
 from nerfcli.atomic import atomic_path, write_json
 from nerfcli.errors import UserError
 from nerfcli.photos.colours import linear_light
-from nerfcli.render.files.depth_pictures import CONVENTION_OF, KEY, DepthMeta, check_map
+from nerfcli.render.files.depth_meta import CONVENTION_OF, KEY, DepthMeta, check_map
 from nerfcli.version import __version__
 
 
