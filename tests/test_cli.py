@@ -505,6 +505,13 @@ def test_results_of_inputs_of_one_name_do_not_replace_each_other(monkeypatch, tm
     assert written == [tmp_path / name for name in names]  # the last one is the same input again
     assert error_of(result)[0].endswith("is the result of a/kitchen, which has the same name")
 
+    def only_asked(photos: Path, output: Output, **more: object) -> None:
+        raise UserError("enough", "of this test")
+
+    monkeypatch.setattr("nerfcli.workflows.pipeline.run_pipeline", only_asked)
+    result = nerfcli("run", "-", "-o", tmp_path, stdin="a/kitchen\nb/kitchen\n")
+    assert "is the result of a/kitchen, which has the same name" in result.stderr
+
 
 def test_a_batch_goes_on_after_paths_that_cannot_be_opened(finished, tmp_path):
     """Too long for the system, not text, and evaluated one by one."""

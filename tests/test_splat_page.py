@@ -25,7 +25,7 @@ def balls() -> Gaussians:
 
 @pytest.fixture
 def page(tmp_path):
-    told: list[str] = []
+    notes: list[str] = []
     path = tmp_path / "a <b>.html"
     write_splat_page(
         *(path, balls()),
@@ -33,9 +33,9 @@ def page(tmp_path):
         world_from_cam=WORLD_FROM_CAM,
         fov_deg=FOV_DEG,
         background=BACKGROUND,
-        notify=told.append,
+        notify=notes.append,
     )
-    assert told == []
+    assert notes == []
     return path
 
 

@@ -368,16 +368,16 @@ def test_the_ssh_command_leads_to_the_printed_address_without_a_user_name_too(fi
     monkeypatch.setattr("getpass.getuser", lambda: {}["uid 1234"])
     monkeypatch.setattr(PageServer, "server_bind", lambda server: setattr(server, "server_address", (host, 8123)))
     monkeypatch.setattr(PageServer, "server_activate", lambda server: None)  # IPv6 may be missing
-    told: list[str] = []
+    printed: list[str] = []
 
     def on_ready(url: str, from_elsewhere: str) -> None:
-        told.extend((url, from_elsewhere))
+        printed.extend((url, from_elsewhere))
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         view_run(finished, Address(host), on_ready=on_ready)
-    assert told[0].startswith(f"http://{reached}:8123/")
-    assert shlex.split(told[1]) == ["ssh", "-L", f"8123:{reached}:8123", socket.gethostname()]
+    assert printed[0].startswith(f"http://{reached}:8123/")
+    assert shlex.split(printed[1]) == ["ssh", "-L", f"8123:{reached}:8123", socket.gethostname()]
 
 
 def test_an_address_of_another_machine_is_refused(finished):

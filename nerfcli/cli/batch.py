@@ -3,7 +3,9 @@
 import io
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from errno import EACCES, ELOOP, ENAMETOOLONG, EPERM
 from pathlib import Path
 
 import typer
@@ -38,7 +40,6 @@ def refuse_scan(path: Path, command: str) -> None:
 
 
 STDIN = "-"
-_HINT = "check the path and its permissions"
 # Commands that read scenes, and those that read runs; the others read captures.
 _READ_SCENES, _READ_RUNS = ("train", "ablate"), ("evaluate", "render", "export", "report", "bench", "info")
 
@@ -61,7 +62,7 @@ class Given:
         """Refuse a path that is also that of the result of another input; with --overwrite, only the last would stay.
 
         Raises:
-            UserError: it is.
+            UserError: another input has this result.
         """
         if (other := self.taken.setdefault(result, self.path)) != self.path:
             raise UserError(
@@ -84,9 +85,21 @@ def for_each_input(source: str, work: Callable[[Given], None], *, command: str) 
         UserError: the only input failed, or standard input held no path.
     """
     if source != STDIN:
-        work(Given(Path(source)))
+        with _unreadable_explained(Path(source)):
+            work(Given(Path(source)))
     elif for_each_path(stdin_paths(), work, command=command) == 0:
         raise no_paths(command)
+
+
+@contextmanager
+def _unreadable_explained(path: Path) -> Iterator[None]:
+    """Explain what the system says of paths that must not be read, or that are too long; other errors pass."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (EACCES, EPERM, ENAMETOOLONG, ELOOP):
+            raise
+        raise UserError(f"{error.filename or path}: {error.strerror}", "check the path and its permissions") from error
 
 
 def for_each_path(paths: Iterable[Path], work: Callable[[Given], None], *, command: str) -> int:
@@ -96,16 +109,13 @@ def for_each_path(paths: Iterable[Path], work: Callable[[Given], None], *, comma
     for path in paths:
         count += 1
         try:
-            with out_of_memory_explained():
+            with out_of_memory_explained(), _unreadable_explained(path):
                 if not command.startswith("ct "):
                     refuse_scan(path, command)
                 work(Given(path, one_of_many=True, taken=taken))
-        except BrokenPipeError:
-            raise
-        except (UserError, OSError) as error:
-            failure = error if isinstance(error, UserError) else UserError(f"{path}: {error.strerror or error}", _HINT)
-            report_error(failure, about=str(path))
-            first_failure = first_failure or failure
+        except UserError as error:
+            report_error(error, about=str(path))
+            first_failure = first_failure or error
         return_freed_memory()
     if first_failure is not None:
         raise typer.Exit(first_failure.exit_code)

@@ -164,7 +164,7 @@ def poses(
     settings = matching.added_to(taken.settings(seed, resources.cores))
 
     def work(given: Given) -> None:
-        scene = writing.beside(Given(without_suffix(given.path), given.one_of_many), "-scene")
+        scene = writing.beside(replace(given, path=without_suffix(given.path)), "-scene")
         if dry_run:
             folder = folder_with_frames(given.path, scene.at(given.path))
             with console.stage(f"poses {folder.name}") as reporter:

@@ -1,5 +1,6 @@
 """nerfcli run: all stages, from photos to splats, a video and a report."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -70,7 +71,7 @@ def run(
 
         done = run_pipeline(
             given.path,
-            writing.inside(Given(without_suffix(given.path), given.one_of_many), "-scene"),
+            writing.inside(replace(given, path=without_suffix(given.path)), "-scene"),
             poses=poses,
             training=settings,
             frames=taken.frames,

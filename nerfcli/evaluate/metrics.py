@@ -187,7 +187,7 @@ def find_perceptual(notify: Callable[[str], None]) -> Perceptual | None:
     """
     found = _perceptual()
     if isinstance(found, str):
-        notify(f"LPIPS is not available{found}")
+        notify(f"LPIPS is not available: {found}")
         return None
     return found
 
@@ -200,12 +200,12 @@ def _perceptual() -> Perceptual | str:
         metric = importlib.import_module("torchmetrics.image.lpip").LearnedPerceptualImagePatchSimilarity
     # A torchvision that was built for another torch fails with a RuntimeError or OSError.
     except (ImportError, RuntimeError, OSError) as error:
-        return f" ({_first_line(error)}); install it with {INSTALL}"
+        return f"{_first_line(error)}; install it with {INSTALL}"
     try:
         with _socket_timeout():
             network = metric(net_type="alex", normalize=True)
     except (RuntimeError, OSError) as error:  # no network (URLError is an OSError), or a truncated file
-        return f": its weights could not be loaded ({_first_line(error)})"
+        return f"its weights could not be loaded ({_first_line(error)})"
 
     def measure(picture: np.ndarray, photo: np.ndarray) -> float:
         pair = [torch.from_numpy(np.ascontiguousarray(p, dtype=np.float32)) for p in (picture, photo)]

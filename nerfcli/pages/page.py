@@ -166,7 +166,7 @@ def _origin_html(origin: str) -> str:
 
 
 def claim_page(output: Output, path: Path, mark: Mark, *, about: str) -> None:
-    """Raise unless a page can be written at a path: nothing is there that may not be replaced.
+    """Raise if a page cannot be written at a path, or something is there that may not be replaced.
 
     Pages with the same mark may always be replaced.
 

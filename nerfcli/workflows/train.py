@@ -111,17 +111,17 @@ class _Task:
     resume: bool
     overwrite: bool
 
-    def fit(self, folder: Path, **told: Any) -> None:
-        """Train into a folder."""
-        memory_bytes = self.memory_bytes
-        loop.train(self.scene, folder, self.settings, resume=self.resume, memory_bytes=memory_bytes, **told)
+    def fit(self, folder: Path, **reporting: Any) -> None:
+        """Train into a folder; `reporting` are the functions that `loop.train` calls."""
+        how = {"resume": self.resume, "memory_bytes": self.memory_bytes}
+        loop.train(self.scene, folder, self.settings, **how, **reporting)
 
 
 def _help(task: _Task) -> None:
-    """Train with the first process, which decides whether to, keeps what comes of it, and reports."""
-    if distributed.from_first(lambda: True):  # or what the first one says instead
-        with TemporaryDirectory() as nobody_reads, suppress(KeyboardInterrupt):
-            task.fit(Path(nobody_reads), notify=silent, on_progress=lambda state: None)
+    """Train together with the first process, which decides whether to train, keeps the result, and reports."""
+    if distributed.from_first(lambda: True):  # the first one sends False if the run is kept
+        with TemporaryDirectory() as unused, suppress(KeyboardInterrupt):
+            task.fit(Path(unused), notify=silent, on_progress=lambda state: None)
 
 
 def _is_kept(task: _Task, reporter: Reporter) -> bool:

@@ -91,7 +91,7 @@ class MappingAttempts:
         self.tell = tell
         self._with_features = sum(photo["features"] >= FEW_FEATURES for photo in evidence(job))
         self.located_from: list[pycolmap.Reconstruction] = []  # the models whose other photos were tried one by one
-        self._results_told = 0
+        self._reported = 0
         self._announced = ""
         self._cut_short: list[str] = []
         self._start = time.perf_counter()
@@ -146,12 +146,12 @@ class MappingAttempts:
         self._announced = what
 
     def tell_results(self) -> None:
-        """Tell the results that have not been told yet."""
-        for attempt in self.record[self._results_told :]:
+        """Report the results that have not been reported yet."""
+        for attempt in self.record[self._reported :]:
             largest, *others = attempt["models"] or ["none"]
             also = f" (and {len(others)} smaller models)" if len(others) > 1 else f" + {others[0]}" if others else ""
             self.tell(f"{attempt['what']}: {largest}{also} of {self.photos} photos registered")
-        self._results_told = len(self.record)
+        self._reported = len(self.record)
 
     def map(self, what: str, start: MapperOptions) -> None:
         """Map from scratch and merge sub-models; the result counts if it places more photos than the best so far."""
