@@ -115,7 +115,7 @@ def export(
     mesh    .ply, .glb or .obj: zero level of truncated signed distances from median depths, with colours
     points  .ply: where median and mean depth agree and two photos see the same point, with normals,
             photos, parallax and spread
-    splats  Gaussians for SuperSplat, Spark, Blender and game engines: .ply, .spz (a seventh of the size), or one
+    splats  Gaussians for SuperSplat, Spark, Blender and game engines: .ply, .spz (a fifth of the size), or one
             .html that shows them without a network; refined on the training photos
 
     Writes RUN.html, RUN-mesh.ply, ... next to the run. Regions that no photo sees stay open. In a .glb, the rotation to

@@ -1,4 +1,4 @@
-"""Splats as Niantic's .spz, a seventh of the .ply: versions 2 and 3 are read, version 3 is written.
+"""Splats as Niantic's .spz, a fifth of the .ply: versions 2 and 3 are read, version 3 is written.
 
 One gzip stream: a header of 16 bytes, then one array per parameter for all Gaussians: positions (24-bit fixed point),
 opacities, colours and logarithmic scales (8 bits), quaternions (the smallest three, 10 bits each; in version 2 x y z
