@@ -38,7 +38,8 @@ def test_a_number_that_was_not_measured_is_a_dash_and_a_cell_from_elsewhere_says
     assert row(page, "fern", "Quality") == "| fern at 1008x756, 20 photos | – | – | – | – | – |"
     assert row(page, "fox", "Poses").startswith("| fox † | 49 of 50 | – |")
     assert "Commit: abc1234. Processor: a processor" in page
-    assert "Date: 30 November 2026. † was measured before or elsewhere: earlier, a processor, 2 November 2026." in page
+    assert "Date: 30 November 2026. † measured at another time or place " in page
+    assert "(commit, processor, date): earlier, a processor, 2 November 2026." in page
 
 
 def test_a_cell_is_measured_once_for_a_commit_and_kept_at_once(monkeypatch, tmp_path):
