@@ -95,6 +95,7 @@ def needed(command: str, folder: Path) -> tuple[Any, ...]:
 def test_help_has_examples_that_parse(command):
     result = nerfcli(*command.split(), "--help")
     assert result.exit_code == 0
+    assert "[default: True]" not in " ".join(result.stdout.split())  # of a flag that switches something off
     after = result.stdout.split("Examples:")[1]
     examples = [line.strip() for line in after.splitlines() if re.match(rf"\s+.*nerfcli {command} ", line)]
     assert examples

@@ -73,8 +73,8 @@ def main_options(version: bool = typer.Option(False, "--version", help="Show the
       nerfcli evaluate photos-scene-run/           -> photos-scene-run/metrics.json
       nerfcli render photos-scene-run/ --cameras orbit --depth conditional --video
       nerfcli report photos-scene-run/             -> photos-scene-run/report.html
-      nerfcli view photos-scene-run/               -> the field in a browser, during the training too
-      nerfcli export photos-scene-run/ --to page   -> photos-scene-run.html; also mesh, points
+      nerfcli view photos-scene-run/               -> the field in a browser, even during training
+      nerfcli export photos-scene-run/ --to page   -> photos-scene-run.html; also splats, mesh, points
     Measure what each component of the model contributes:
       nerfcli ablate photos-scene/                 -> photos-scene-ablation/
     Convert cameras between formats:

@@ -40,8 +40,8 @@ def ablate(
 
     Trains the model that `train --model auto` selects, and variants with one component less or more, all for the same
     time or number of steps and with the same seeds, and compares them on the held-out photos. Each difference comes
-    with its 95 % interval over the seeds and a verdict. Nothing is selected by it. Masks are not varied because they
-    change what is measured. For the components see `nerfcli train --help`.
+    with its 95 % interval over the seeds and a verdict. Later trainings do not use the result. Masks are
+    not varied because they change what is measured. For the components see `nerfcli train --help`.
 
     PSNR is measured on about 16,000 random pixels of the held-out photos: the same pixels for all variants of a seed,
     other pixels for each seed, so that the interval includes the choice of pixels. `nerfcli evaluate` measures the runs

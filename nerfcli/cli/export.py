@@ -54,20 +54,21 @@ class SplatOptions:
 
     count: Annotated[
         int | None,
-        typer.Option(help="Largest number of splats.  [default: by photos and budget]", min=100, max=10_000_000),
+        typer.Option(help="Maximum number of splats.  [default: by photos and budget]", min=100, max=10_000_000),
     ] = None
     budget: Annotated[
         str | None, typer.Option(help="Time to refine splats on the training photos.  [default: 60s]")
     ] = None
     sh: Annotated[
         int | None,
-        typer.Option(help="Degree of the harmonics by which colours of splats vary.  [default: 2]", min=0, max=3),
+        typer.Option(help="Degree of the spherical harmonics of splat colours.  [default: 2]", min=0, max=3),
     ] = None
     frame: Annotated[
-        str | None, typer.Option(help="Of splats: viewer (y down, as viewers expect) or scene.  [default: viewer]")
+        str | None,
+        typer.Option(help="Frame of splats: viewer (y down, as viewers expect) or scene.  [default: viewer]"),
     ] = None
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on refining the splats of the run, to a larger --budget.")
+        bool, typer.Option("--resume", help="Continue to refine the splats of the run, to a larger --budget.")
     ] = False
 
     def settings(self) -> "SplatSettings":

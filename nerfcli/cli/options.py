@@ -84,7 +84,9 @@ FieldMemory = Annotated[
 ]
 Contraction = Annotated[
     str,
-    typer.Option(help="Map distant space into a ball (l2), or not at all (none); auto: none with alpha."),
+    typer.Option(
+        help="Map distant space into a ball (l2), or not at all (none); auto: l2, but none for photos with alpha."
+    ),
 ]
 DeviceMemory = Annotated[
     str | None,

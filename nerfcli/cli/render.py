@@ -117,18 +117,18 @@ class DepthOptions:
         typer.Option(help="Pixels with less opacity have no depth (NaN).", min=0, max=1),
     ] = 0.5
     min_views: Annotated[
-        int, typer.Option(help="Pixels whose surface fewer training photos see have no depth (NaN).", min=0)
+        int, typer.Option(help="Remove depth (NaN) where fewer training photos see the surface.", min=0)
     ] = 0
     min_parallax: Annotated[
         float,
         typer.Option(
-            help="Pixels whose surface no two training photos see at this angle, in degrees, have no depth (NaN).",
+            help="Remove depth (NaN) where no two training photos see the surface at this angle, in degrees.",
             min=0,
             max=180,
         ),
     ] = 0.0
     background_distance: Annotated[
-        float | None, typer.Option(help="Distance of light that passes, for --depth background, in scene units.", min=0)
+        float | None, typer.Option(help="Distance of light that hits nothing (--depth background), scene units.", min=0)
     ] = None
 
     def request(self, outputs: tuple[str, ...]) -> "DepthRequest":

@@ -30,7 +30,10 @@ class Fit:
         int | None, typer.Option(help="Total optimizer steps; results repeat bit for bit on a CPU.", min=1)
     ] = None
     sensor_depth: Annotated[
-        bool, typer.Option("--no-sensor-depth", help="Leave out depth maps of a sensor, like --without sensor.")
+        bool,
+        typer.Option(
+            "--no-sensor-depth", help="Ignore depth maps of a sensor, like --without sensor.", show_default=False
+        ),
     ] = True
     include: options.Include = None
     exclude: options.Exclude = None
@@ -59,10 +62,13 @@ class Fit:
     holdout: options.Holdout = None
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Continue from the last checkpoint to the new total; without one, start."),
+        typer.Option("--resume", help="Continue from the last checkpoint to the new total; start if there is none."),
     ] = False
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show how much memory, disk and time it would take, and its schedule.")
+        bool,
+        typer.Option(
+            "--dry-run", help="Show the memory, disk space, time and schedule of the training, without training."
+        ),
     ] = False
 
     def settings(self, training: options.Training) -> "TrainSettings":
@@ -130,11 +136,11 @@ def train(
       masks       ignore, empty: whether black in masks is unknown or empty space
       points      a weight: surfaces at the 3D points of matched features
       stereo      true, false: with points, also at depths from stereo matching of the training photos
-      sensor      true, false: surfaces at the depths of a sensor, where the capture has its maps
+      sensor      true, false: surfaces at the depths of a sensor, if the capture has depth maps
       near        true, false: smaller gradients near cameras
       distortion  a weight: concentrate the density along each ray
       antialias   true, false: fade out details smaller than a pixel; for photos from near and far
-      occluders   true, false: leave out what hides, in one photo, a surface that others see
+      occluders   true, false: ignore what hides, in one photo, a surface that other photos see
 
     Unless they are set with --with or --without, points, stereo, sensor, occluders, exposure, cameras, background and
     view are selected automatically. The first four and exposures from matched pixels are used where the photos support

@@ -216,9 +216,7 @@ class FitOptions:
     ] = "auto"
     resume: Annotated[
         bool,
-        typer.Option(
-            "--resume", help="Continue the run, with its other settings, to the new total; without one, start."
-        ),
+        typer.Option("--resume", help="Continue the run, with its settings, to the new total; start if there is none."),
     ] = False
 
     def settings(self, threads: int) -> "ReconstructionSettings":
