@@ -111,7 +111,9 @@ def device_name(device: str) -> str:
         )
     if named[1] is not None and int(named[1]) >= torch.cuda.device_count():
         last = torch.cuda.device_count() - 1
-        raise UserError(f"--device {device}: there is no such device", f"the last one is cuda:{last}")
+        raise UserError(
+            f"--device {device}: there is no such device", f"use --device cuda:0{f' to cuda:{last}' if last else ''}"
+        )
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     number, count = local_rank_and_size()

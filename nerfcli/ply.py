@@ -31,7 +31,7 @@ _TYPES = {word: code for code, words in _WORDS.items() for word in words}
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 # Longest header, in bytes.
 _MOST_HEADER = 2**20
-_HINT = "copy or export it once more"
+_HINT = "copy or export it again"
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def read_ply_header(path: Path) -> PlyHeader:
     line_end = head.find(b"\n", end)
     if head[:3] != b"ply" or end < 0 or line_end < 0:
         fault = "it does not begin with the word ply" if head[:3] != b"ply" else "its header has no end"
-        raise UserError(f"{path} is no PLY file: {fault}", _HINT)
+        raise UserError(f"{path} is not a PLY file: {fault}", _HINT)
     encoding, elements, comments = "", [], []
     for line in head[:end].decode("utf-8", errors="replace").splitlines():
         match line.split():
@@ -125,7 +125,7 @@ def read_ply_vertices(path: Path) -> np.ndarray:
     there = max(0, path.stat().st_size - start)
     if vertex.count * dtype.itemsize > there:
         raise UserError(
-            f"{path} is cut short: its header announces {vertex.count} vertices, but {there} bytes follow", _HINT
+            f"{path} is truncated: its header announces {vertex.count} vertices, but {there} bytes follow", _HINT
         )
     if not vertex.count:
         return np.zeros(0, dtype)
@@ -137,7 +137,7 @@ def _ascii_rows(path: Path, start: int, num_before: int, count: int, dtype: np.d
     lines = [line for line in text.splitlines() if line.strip()][num_before:]
     if count > len(lines):
         raise UserError(
-            f"{path} is cut short: its header announces {count} vertices, but {len(lines)} lines are there", _HINT
+            f"{path} is truncated: its header announces {count} vertices, but {len(lines)} lines are there", _HINT
         )
     names = dtype.names or ()
     rows = [line.split()[: len(names)] for line in lines[:count]]
@@ -165,7 +165,7 @@ def read_ply_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     data = path.read_bytes()
     start = header.start + vertices.nbytes
     if header.encoding == "ascii" or len(data) < start + triangles * faces.itemsize:
-        raise UserError(f"{path} is no binary PLY file of triangles, or cut short", _HINT)
+        raise UserError(f"{path} is not a binary PLY file of triangles, or is truncated", _HINT)
     listed = np.frombuffer(data, faces, triangles, start)
     return np.stack([vertices[axis] for axis in "xyz"], axis=-1), listed["vertices"].astype(np.int64)
 

@@ -170,7 +170,7 @@ def test_sizes_that_are_stated_too_small_and_full_disks_leave_nothing(tmp_path, 
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("a.txt", "abc")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Disk(free=2))
-    with pytest.raises(UserError, match=r"would need 0.0 GB, and .* has 0.0 GB"):
+    with pytest.raises(UserError, match=r"would need 0.0 GB, and .* has only 0.0 GB"):
         unpack(path, tmp_path / "scene")
     assert [item.name for item in tmp_path.iterdir()] == ["liar.zip"]
 

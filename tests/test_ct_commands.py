@@ -299,9 +299,7 @@ def test_a_hash_grid_of_an_earlier_version_is_refused(bean_run: Path, tmp_path: 
     write_sealed(run / DESCRIPTION, content)
     code, _, err = call("evaluate", run)
     assert code == 3
-    assert err.splitlines()[0] == (
-        f"Error: {run} is a hash grid, which scans no longer have: voxels are better in the same time"
-    )
+    assert err.splitlines()[0] == (f"Error: {run} is a hash grid by an earlier version, which this version cannot read")
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def test_devices_by_name(two_gpus):
     assert [device_name(name) for name in ("auto", "cpu", "cuda", "cuda:1")] == ["cuda", "cpu", "cuda", "cuda:1"]
     with pytest.raises(UserError, match="--device cuda:2: there is no such device") as caught:
         device_name("cuda:2")
-    assert caught.value.hint == "the last one is cuda:1"
+    assert caught.value.hint == "use --device cuda:0 to cuda:1"
 
 
 @pytest.mark.parametrize("name", ["cuda:", "cuda:x", "gpu", "cpu:0", ""])

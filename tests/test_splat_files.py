@@ -202,26 +202,26 @@ REFUSED = {
     "mesh.ply": (ply(*FACES, body=bytes(25)), "holds a mesh, not splats"),
     "compressed.ply": (ply(*CHUNKS), "is a compressed .ply of PlayCanvas"),
     "text.ply": (ply(*NEEDED, form="ascii", body=b"1 2 3\n"), "a vertex has fewer than 23 numbers"),
-    "short.ply": (ply(*NEEDED, body=bytes(91)), "is cut short: its header announces 1 vertices, but 91 bytes"),
-    "enormous.ply": (ply(f"element vertex {10**15}", *NEEDED[1:], body=bytes(100)), "is cut short"),
-    "empty.ply": (ply("element vertex 0", *NEEDED[1:]), "holds no splats"),
+    "short.ply": (ply(*NEEDED, body=bytes(91)), "is truncated: its header announces 1 vertices, but 91 bytes"),
+    "enormous.ply": (ply(f"element vertex {10**15}", *NEEDED[1:], body=bytes(100)), "is truncated"),
+    "empty.ply": (ply("element vertex 0", *NEEDED[1:]), "contains no splats"),
     "degree.ply": (ply(*NEEDED, *floats(["f_rest_9"]), body=bytes(96)), "has 10 properties f_rest_"),
     "lists.ply": (ply(*NEEDED, "property list uchar int ids"), "its vertices contain lists"),
     "twice.ply": (ply(*NEEDED, "property float x"), "its header has the line 'property float x'"),
     "zeros.ply": (ply(*NEEDED, body=bytes(92)), "none of its 1 splat"),
-    "other.ply": (b"solid cube", "is no PLY file"),
-    "splats.sog": (b"", "is no file of splats that nerfcli knows"),
-    "old.spz": (spz(4, 1), "damaged: version 1"),
+    "other.ply": (b"solid cube", "is not a PLY file"),
+    "splats.sog": (b"", "is not a supported file of splats"),
+    "old.spz": (spz(4, 1), "degree 0 to 3: version 1"),
     "new.spz": (b"NGSP" + struct.pack("<I", 4) + bytes(24), "is a .spz of version 4 or later"),
     "degree.spz": (spz(12, 4), "of degree 4"),
     "empty.spz": (spz(8, 0), "0 splats"),
     "bomb.spz": (gzip.compress(OFFICIAL_3[:8] + b"\xff\xff\xff\xff" + bytes(2**22)), "4294967295 splats cannot be in"),
     "longer.spz": (spz(0, more=bytes(2**21)), "it has a MB more"),
     "short.spz": (spz(8, 2), "2 splats take"),
-    "cut.spz": (spz(0)[:-20], "damaged: Compressed file ended"),
-    "checksum.spz": (spz(0)[:-8] + bytes(8), "damaged: CRC check failed"),
+    "cut.spz": (spz(0)[:-20], "damaged.*: Compressed file ended"),
+    "checksum.spz": (spz(0)[:-8] + bytes(8), "damaged.*: CRC check failed"),
     "axes.spz": (spz(14, 2, more=struct.pack("<7I", 7, 8, 0, 0, 0xADBE0003, 4, 6)), "axes are those with the number 6"),
-    "text.spz": (b"splats", "damaged: Not a gzipped file"),
+    "text.spz": (b"splats", "damaged.*: Not a gzipped file"),
 }
 
 
@@ -238,7 +238,7 @@ def test_other_files_are_refused_in_two_lines_without_memory(tmp_path, name):
 
 
 def test_missing_files_and_other_suffixes(tmp_path):
-    with pytest.raises(UserError, match="there is no"):
+    with pytest.raises(UserError, match="does not exist"):
         read_splats(tmp_path / "b.ply", silent)
-    with pytest.raises(UserError, match="is no file of splats that nerfcli knows"):
+    with pytest.raises(UserError, match="is not a supported file of splats"):
         write_splats(tmp_path / "a.splat", ONE, description=None, notify=silent)

@@ -272,7 +272,7 @@ def test_foreign_splats_are_rendered_with_the_cameras_of_a_file(run: Path, tmp_p
     picture = nerfcli.load_splats(ply).render(frame).rgb
     shown = read_image(next(rgb.rglob(f"{Path(frame.name).stem}.png")))
     assert np.abs(shown / 255 - picture).max() < 0.003
-    with pytest.raises(UserError, match=r"there is no .*c\.ply"):
+    with pytest.raises(UserError, match=r"c\.ply does not exist"):
         render_file(tmp_path / "c.ply", views=Views("orbit"), settings=settings)
     with pytest.raises(UserError, match="has no cameras"):
         render_file(ply, views=Views("orbit"), settings=settings)

@@ -219,7 +219,7 @@ def measure_renderings(run: Run, *, resources: Resources, seconds: float, save: 
     model = run.model(device)
     photos = held_out_photos(run, run.cameras.test)
     if not photos:
-        raise UserError(f"{run.path} has no held-out photos", "by default every 8th photo is held out; check the split")
+        raise UserError(f"{run.path} has no held-out photos", "train again with --holdout every:8 --overwrite")
     settings = render_settings(resources.cores)
     tell(0.0, "rendering a first picture")
     _render(model, photos[0], settings[0])
@@ -276,7 +276,9 @@ def measure_trainings(
         UserError: see `nerfcli.training.loop.train`; or nothing was held out.
     """
     if not scene.test_frames:
-        raise UserError(f"{scene.root} has no held-out photos", "by default every 8th photo is held out")
+        raise UserError(
+            f"{scene.root} has no held-out photos", "its split lists none: name some, such as every 8th photo"
+        )
     device = resources.torch_device
     base = TrainSettings(device=device, threads=resources.cores, **sizes_for(device))
     chosen, unit = affordable(train_settings(), seconds, overhead=6.0)

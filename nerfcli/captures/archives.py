@@ -154,7 +154,7 @@ def _extract(
     home = next(parent for parent in folder.parents if parent.exists())
     if total > (free := shutil.disk_usage(home).free):
         raise UserError(
-            f"{folder} would need {total / 1e9:.1f} GB, and {home} has {free / 1e9:.1f} GB",
+            f"{folder} would need {total / 1e9:.1f} GB, and {home} has only {free / 1e9:.1f} GB",
             "free some space, or choose another output",
         )
     done = 0

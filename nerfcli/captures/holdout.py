@@ -67,7 +67,7 @@ def names_held_out(rule: str, names: Iterable[str], *, others: Iterable[str] = (
     if not held_out or len(held_out) == len(present):
         raise UserError(
             f"the split {rule} holds out {len(held_out)} of {len(present)} photos",
-            "some photos are needed for training and some for evaluation",
+            "choose another --holdout: some photos are needed for training and some for evaluation",
         )
     return held_out
 

@@ -82,7 +82,8 @@ def judge(scan: Scan, *, progress: Progress = no_progress) -> Judgement:
     """
     if scan.geometry.views < FEWEST_VIEWS:
         raise UserError(
-            f"{scan.geometry.views} views are too few to judge the geometry", f"at least {FEWEST_VIEWS} are needed"
+            f"{scan.geometry.views} views are too few to judge the geometry",
+            f"use a scan with at least {FEWEST_VIEWS} views",
         )
     row = highest_contrast_row(scan).thinned()
     stated = axis_column(scan.geometry)

@@ -60,7 +60,7 @@ def recognise(path: Path) -> str | None:
     for form in _SUFFIXES:
         files = files_of(path, form)
         if len(files) > 1:
-            raise UserError(f"{path} holds several scans: {files[0].name}, {files[1].name}", "give the file of one")
+            raise UserError(f"{path} holds several scans: {files[0].name}, {files[1].name}", "give one of these files")
         if files:
             return form
     return None

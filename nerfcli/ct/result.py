@@ -157,8 +157,8 @@ def load_reconstruction(run: Path) -> Reconstruction:
         settings.pop("seed", None)  # of earlier runs
         if settings.pop("field", "voxels") != "voxels":
             raise UserError(
-                f"{run} is a hash grid, which scans no longer have: voxels are better in the same time",
-                "train the scan again, into another folder",
+                f"{run} is a hash grid by an earlier version, which this version cannot read",
+                "train the scan again, into another folder: voxels are better in the same time",
             )
         if settings["strength"] is None:  # earlier runs could choose it
             settings["strength"] = content["used"]["strength"]

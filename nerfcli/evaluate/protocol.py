@@ -254,7 +254,7 @@ def evaluate_model(
     if not held_out:
         raise UserError(
             "this run has no held-out photos to evaluate on",
-            "by default every 8th photo is held out; check the split with nerfcli info RUN",
+            "train again with --holdout every:8 --overwrite",
         )
     total = sum(photo.pixels.shape[0] * photo.pixels.shape[1] for photo in held_out)
     done = 0

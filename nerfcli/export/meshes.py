@@ -267,7 +267,7 @@ def read_glb_json(path: Path) -> dict[str, Any]:
             raise ValueError("its header is not that of glTF 2.0")
         content = json.loads(data[20 : 20 + size])
     except (struct.error, ValueError) as error:
-        raise UserError(f"{path} is no GLB file, or cut short: {error}", "export it once more") from error
+        raise UserError(f"{path} is not a GLB file, or is truncated: {error}", "export it again") from error
     return content
 
 
@@ -295,7 +295,7 @@ def model_facts(path: Path) -> dict[str, Any]:
         UserError: the file is missing or damaged.
     """
     if not path.is_file():
-        raise UserError(f"there is no {path}", "give a file that exists")
+        raise UserError(f"{path} does not exist", "give a file that exists")
     match path.suffix.lower():
         case ".ply":
             header = read_ply_header(path)
@@ -334,7 +334,7 @@ def _obj_facts(path: Path) -> dict[str, Any]:
             elif word == "#":
                 comments.append(line[1:].strip())
     if not counts["v"]:
-        raise UserError(f"{path} has no vertices", "copy or export it once more")
+        raise UserError(f"{path} has no vertices", "copy or export it again")
     return {**_described(comments), **_counts("OBJ", counts["v"], counts["f"])}
 
 

@@ -80,7 +80,9 @@ def render_job(
     frames = range(len(job.frames))
     chosen = frames if part is None else frames[part]
     if not chosen:
-        raise UserError(f"--frames: there are only {len(frames)} views", "views are counted from 0", exit_code=2)
+        raise UserError(
+            f"--frames selects none of the {len(frames)} views", f"give a part of 0:{len(frames)}, or K/N", exit_code=2
+        )
     unfinished = _Unfinished(folder.with_name(f".{folder.name}.unfinished-{job.digest}"))
     if job.is_kept_in(folder, output):
         reporter.note(f"{folder} is kept: it is complete and has these settings; add --overwrite to render again")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.errors import NON_FINITE, UserError
+from nerfcli.errors import NON_FINITE, UserError, several
 from nerfcli.field.background import Background, colours_behind
 from nerfcli.kernels import RayTermination
 from nerfcli.render.depth import DepthRequest, disagreement, fractions, median, requested, spread
@@ -120,7 +120,7 @@ def _refuse_non_finite(frame: Frame, maps: dict[str, np.ndarray]) -> None:
             bad = ~np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1)
             y, x = np.argwhere(bad)[0]
             raise UserError(
-                f"{name} of {frame.name} is not finite at pixel ({x}, {y}), of {bad.sum()} in all",
+                f"{name} of {frame.name} is not finite at {several(int(bad.sum()), 'pixel')}, such as ({x}, {y})",
                 "the field overflows there: train again with --overwrite and another --seed, and please report this",
                 NON_FINITE,
             )

@@ -63,7 +63,7 @@ def read_splat_ply(path: Path, notify: Callable[[str], None]) -> Gaussians:
         )
     table = read_ply_vertices(path)
     if not len(table):
-        raise UserError(f"{path} holds no splats", "export it once more")
+        raise UserError(f"{path} contains no splats", "export it again")
     return _from_table(path, table, _names(degree), notify=notify)
 
 
@@ -86,7 +86,7 @@ def _from_table(path: Path, table: np.ndarray, names: list[str], *, notify: Call
             array[kept : kept + len(values)] = part
         kept += len(values)
     if not kept:
-        raise UserError(f"{path}: none of its {several(len(table), 'splat')} has finite numbers", "export it once more")
+        raise UserError(f"{path}: none of its {several(len(table), 'splat')} has finite numbers", "export it again")
     if kept < len(table):
         notify(f"{path}: {len(table) - kept} of {len(table)} splats left out, whose numbers are not finite")
     return Gaussians(*(array[:kept] for array in arrays))
@@ -117,7 +117,7 @@ def read_splats(path: Path, notify: Callable[[str], None]) -> tuple[Gaussians, d
         UserError: the file is missing, damaged or of another kind.
     """
     if not path.is_file():
-        raise UserError(f"there is no {path}", "give a .ply or .spz of splats")
+        raise UserError(f"{path} does not exist", "give a .ply or .spz of splats")
     if _suffix(path) == ".spz":
         return read_spz(path, notify)
     return read_splat_ply(path, notify), description_in(read_ply_header(path).comments)
@@ -167,7 +167,7 @@ def _suffix(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise UserError(
-            f"{path} is no file of splats that nerfcli knows: its suffix is neither .ply nor .spz",
+            f"{path} is not a supported file of splats: its suffix is neither .ply nor .spz",
             "convert others: npx @playcanvas/splat-transform in.sog out.ply",
         )
     return suffix

@@ -94,7 +94,7 @@ def read_spz(path: Path, notify: Callable[[str], None]) -> tuple[Gaussians, dict
         gaussians = unpacked(head + body + more)
     except (EOFError, gzip.BadGzipFile, zlib.error, struct.error, ValueError) as error:
         raise UserError(
-            f"{path} is no .spz of version 2 or 3 and degree 0 to 3, or damaged: {error}", "copy or export it once more"
+            f"{path} is damaged, or not a .spz of version 2 or 3 and degree 0 to 3: {error}", "copy or export it again"
         ) from error
     if head[14] & _ANTIALIASED:
         notify(f"{path} was made for antialiased rendering (Mip-Splatting); nerfcli shows its thin parts too thick")

@@ -63,7 +63,7 @@ def ablate_scene(
     """
     scene = load_scene(path)
     if not scene.test_frames:
-        raise UserError(f"{path} has no held-out photos", "by default every 8th photo is held out; check its split")
+        raise UserError(f"{path} has no held-out photos", "its split lists none: name some, such as every 8th photo")
     folder = output.beside(path, "-ablation")
     about: dict[str, Any] = {"scene": str(path), "settings": settings.to_json()}
     about |= {"seeds": seeds, "varied": list(only or CHOICES)}

@@ -130,7 +130,7 @@ def render_splats(
     """
     path = Path(file)
     if not path.is_file():
-        raise UserError(f"there is no {path}", "give a .ply or .spz of splats")
+        raise UserError(f"{path} does not exist", "give a .ply or .spz of splats")
     if views.cameras in ("test", "train", *PATHS):
         raise UserError(
             f"{path} has no cameras, so --cameras {views.cameras} is not known",

@@ -72,7 +72,9 @@ def scan_of(found: ReaderOutput, given: ScanOptions) -> Scan:
         with np.errstate(over="raise", divide="raise", invalid="raise"):
             geometry = placed.geometry() if isinstance(placed, Circle) else placed
     except FloatingPointError as error:
-        raise UserError(f"{found.path}: distances or sizes are too large or too small", "correct them") from error
+        raise UserError(
+            f"{found.path}: distances or sizes are too large or too small", "correct the numbers or their unit"
+        ) from error
     if values.shape != (geometry.views, geometry.rows, geometry.columns):
         views, rows, columns = values.shape
         raise UserError(
@@ -204,7 +206,10 @@ def _photons(found: ReaderOutput, given: ScanOptions) -> float | None:
     """Return the photons per detector value for counts, else per transmission of 1."""
     if given.photons is not None:
         if not (np.isfinite(given.photons) and given.photons > 0):
-            raise UserError(f"--photons {given.photons:g}", "give the photons per pixel of the open beam, above 0")
+            raise UserError(
+                f"--photons {given.photons:g} is not a number of photons",
+                "give the photons per pixel of the open beam, above 0",
+            )
         if found.kind == "line_integral":
             raise UserError(
                 "--photons does not apply to line integrals: their noise is no longer that of counting",

@@ -37,14 +37,17 @@ def read_r2_gaussian(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
         raise UserError(f"{file} names no projections", _HINT)
     values = [_projection(file, frame) for _, frame in frames]
     if any(value.shape != values[0].shape for value in values):
-        raise UserError(f"{file}: projections have different sizes", "the projections of a scan have one size")
+        raise UserError(
+            f"{file}: projections have different sizes",
+            "all projections of a scan must have one size: remove the others",
+        )
     rows, columns = values[0].shape
     angles = angles_in_radians(
         np.array([_angle(frame) for _, frame in frames]), views=len(frames), unit="rad", where=f"{file}: angle"
     )
     mode = scanner.text("mode")
     if mode not in ("cone", "parallel"):
-        raise UserError(f"{file}: mode {mode!r}", "cone and parallel beams are read")
+        raise UserError(f"{file}: mode is {mode!r}", "write cone or parallel: no other beams are supported")
     count = _pair(scanner, "nDetector")
     if "dDetector" in scanner:
         height, width = _pair(scanner, "dDetector")
@@ -57,7 +60,7 @@ def read_r2_gaussian(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
             "nDetector is [rows, columns]: correct it, or the projections",
         )
     if not (width > 0 and height > 0):
-        raise UserError(f"{file}: pixels of {width:g} x {height:g}", "sDetector has to be above 0")
+        raise UserError(f"{file}: pixels of {width:g} x {height:g}", "give sizes above 0 in sDetector or dDetector")
     right, up = _pair(scanner, "offDetector", (0.0, 0.0))
     cone = mode == "cone"
     circle = Circle(

@@ -101,11 +101,11 @@ def _circle(fields: Statement, beam: Beam, *, views: int, rows: int, columns: in
     angles = angles_in_radians(numbers, views=views, unit=name.removeprefix("angles_"), where=f"{where}: {name}")
     direction = str(fields.value("direction", "counter-clockwise"))
     if direction not in ("counter-clockwise", "clockwise"):
-        raise UserError(f"{where}: direction {direction!r}", "write counter-clockwise or clockwise, seen from above")
+        raise UserError(f"{where}: direction is {direction!r}", "write counter-clockwise or clockwise, seen from above")
     sides = fields.value("pixel_size")
     sides = list(sides) if isinstance(sides, list) else [sides, sides]
     if len(sides) != 2 or not all(isinstance(side, int | float) and side > 0 for side in sides):
-        raise UserError(f"{where}: pixel_size is {fields.value('pixel_size')!r}", "width and height above 0")
+        raise UserError(f"{where}: pixel_size is {fields.value('pixel_size')!r}", "give a width and a height above 0")
     mirrored = bool(fields.value("mirrored", False))
     middle = (columns - 1) / 2, (rows - 1) / 2
     shift = middle[0] - fields.number("centre_of_rotation", middle[0])
@@ -168,7 +168,7 @@ def _held_out(fields: Statement, views: int) -> list[int] | None:
     if stated is None:
         return None
     if not isinstance(stated, list) or not all(isinstance(view, int) and 0 <= view < views for view in stated):
-        raise UserError(f"{fields.path}: held_out is {stated!r}", f"a list of views from 0 to {views - 1}")
+        raise UserError(f"{fields.path}: held_out is {stated!r}", f"give a list of views from 0 to {views - 1}")
     return stated
 
 
@@ -179,16 +179,18 @@ def _truth(fields: Statement, factor: float) -> dict[str, Any]:
     given = fields.value("truth")
     if not isinstance(given, dict):
         raise UserError(
-            f"{fields.path}: truth is {given!r}", "an object with volume, voxel_size, attenuation_per_value"
+            f"{fields.path}: truth is {given!r}", "give an object with volume, voxel_size, attenuation_per_value"
         )
     stated = Statement(fields.path, given, hint="truth has volume, voxel_size and attenuation_per_value")
     path = fields.path.parent / stated.text("volume")
     try:
         shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
     except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {error}", f"{fields.path.name} names it as the true volume") from error
+        raise UserError(
+            f"{path} cannot be read: {error}", f"restore it, or remove truth from {fields.path.name}"
+        ) from error
     if len(shape) != 3:
-        raise UserError(f"{path} has shape {shape}", "a volume is z x y x x")
+        raise UserError(f"{path} has shape {shape}", "a volume has three axes: z, y, x")
     size = stated.positive("voxel_size") * factor
     value = stated.positive("attenuation_per_value") / factor
     return described_truth(path, "zyx", shape, size=size, attenuation_per_value=value)
@@ -197,5 +199,5 @@ def _truth(fields: Statement, factor: float) -> dict[str, Any]:
 def _one_of(fields: Statement, name: str, choices: tuple[str, ...]) -> str:
     text = fields.text(name)
     if text not in choices:
-        raise UserError(f"{fields.path}: {name} {text!r}", f"choose one of {', '.join(choices)}")
+        raise UserError(f"{fields.path}: {name} is {text!r}", f"choose one of {', '.join(choices)}")
     return text

@@ -39,7 +39,7 @@ def read_transmission_transforms(path: Path, given: ScanOptions = ScanOptions())
     if isinstance(expected, int) and expected != len(frames):
         raise UserError(
             f"{folder}: {len(frames)} frames in the transforms, but {TRANSFORMS_GEOMETRY} states {expected}",
-            "a transform is missing",
+            "check that no transform is missing",
         )
     try:
         poses = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)
@@ -96,7 +96,10 @@ def _frames(folder: Path) -> tuple[list[dict[str, Any]], Statement]:
     names = [frame["file_path"] for frame in frames]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise UserError(f"{folder}: {twice} is listed twice", "no view may be trained on and held out")
+        raise UserError(
+            f"{folder}: {twice} is listed twice",
+            "remove it from one of the two files: a view is either trained on or held out",
+        )
     return sorted(frames, key=lambda frame: str(frame["file_path"])), lens
 
 
