@@ -242,7 +242,7 @@ def test_an_interrupt_saves_the_splats_and_writes_no_file(run: Path, monkeypatch
         )
     assert not target.exists()
     assert load_splat_state(run / SPLATS).refinement.steps == 3
-    assert told[-1] == "the splats are saved; the same command with --resume goes on"
+    assert told[-1] == "the splats are saved; to continue, add --resume to the same command"
 
 
 def test_splats_are_measured_by_the_protocol_of_fields(run: Path) -> None:

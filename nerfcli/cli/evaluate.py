@@ -61,7 +61,7 @@ def evaluate(
 
     one_of(save_predictions, KINDS, "--save-predictions")
     if splats is not None and (len(runs) > 1 or STDIN in runs):
-        raise typer.BadParameter("splats belong to one run; give only that", param_hint="--splats")
+        raise typer.BadParameter("give only one run: splats belong to one", param_hint="--splats")
     if splats is not None and not splats.is_file():
         raise typer.BadParameter(f"there is no {splats}", param_hint="--splats")
     if STDIN in runs and len(runs) > 1:

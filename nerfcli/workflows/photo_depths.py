@@ -94,7 +94,7 @@ def _without_masked(view: DepthMap, frame: Frame, notify: Notify) -> DepthMap:
     try:
         mask = read_mask(frame.mask, frame.image)
     except UserError as error:  # the photos of a run may be gone
-        notify(f"{frame.name} counts without its mask: {error.message}")
+        notify(f"the mask of {frame.name} is ignored: {error.message}")
         return view
     height, width = view.distances.shape
     used = cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA) >= 128

@@ -183,8 +183,8 @@ def run_splats(run: Run, model: Model, *, settings: SplatSettings, reporter: Rep
         )
         save_splats(run.path / SPLATS, splats)
         if interrupts.came is not None:
-            again = "goes on" if settings.resume is None else "with --resume goes on"
-            reporter.note(f"the splats are saved; the same command {again}")
+            again = "run" if settings.resume is None else "add --resume to"
+            reporter.note(f"the splats are saved; to continue, {again} the same command")
         interrupts.raise_if_pending()
     reporter.note(compared_in_words(model, loaded, splats))
     return splats
@@ -207,7 +207,7 @@ def _kept(run: Run, model: Model, settings: SplatSettings) -> RunSplats | None:
     if settings.resume and not same:
         raise UserError(
             f"the splats in {run.path} are missing, or were made from another field, --count or --sh",
-            "leave out --resume",
+            "leave out --resume to make new splats",
         )
     if not same or splats is None:
         return None

@@ -41,7 +41,7 @@ from nerfcli.ct.scan import KINDS, Kind, Scan
 from nerfcli.ct.truth import described_truth
 from nerfcli.errors import UserError
 
-_HINT = "a scan.json states projections, kind, beam, pixel_size, unit and angles_deg; see nerfcli's guide of tomography"
+_HINT = "a scan.json states projections, kind, beam, pixel_size, unit and angles_deg; see docs/tomography.md"
 _KEYS = (
     *("projections", "flats", "darks", "white_level", "kind", "beam", "unit", "pixel_size", "source_origin"),
     *("source_detector", "angles_deg", "angles_rad", "direction", "mirrored", "centre_of_rotation", "centre_row"),
