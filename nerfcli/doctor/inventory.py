@@ -166,7 +166,7 @@ def duplicates(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
     fraction = len(remarks) / len(photos)
     verdict = verdict_above(fraction, look=1e-9, bad=0.3) if exact or fraction > 0.1 else GOOD
     summary = f"{exact} exact duplicates, {len(remarks) - exact} taken from the same place as another"
-    advice = "remove them: they cost time, and a held-out photo is no test if its duplicate is used for training"
+    advice = "remove them: they cost time, and a held-out photo tests nothing if its duplicate is used for training"
     return Finding("duplicates", verdict, summary, len(remarks), threshold, advice, tuple(remarks.items()))
 
 

@@ -52,8 +52,8 @@ _MISPLACED = (
     "structure from motion; remove them from the scene, or estimate poses from the photos with nerfcli poses"
 )
 _INACCURATE = (
-    "poses by tracking drift, and focal lengths are off at times: train optimizes them if matches suggest it; "
-    "nerfcli poses on the photos may do better"
+    "poses from tracking drift, and their focal lengths may be wrong: train refines them if matches show it; nerfcli "
+    "poses on the photos may do better"
 )
 
 

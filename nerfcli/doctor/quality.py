@@ -177,7 +177,7 @@ def clipping(photos: Sequence[PhotoFacts]) -> Finding:
         return Finding("clipping", GOOD, "little", 0.0, threshold)
     verdict = BAD if verdicts.count(BAD) >= 0.3 * len(photos) else LOOK
     summary = f"{several(len(flagged), 'photo')} of {len(photos)} with large pure white or black areas, or dark"
-    advice = "expose so that the subject is neither; such areas cannot be matched (in a background this is fine)"
+    advice = "expose so that the subject is neither white nor black, which cannot be matched; a background may be"
     remarks = tuple((name, what) for _, name, what in sorted(flagged, key=lambda item: -item[0]))
     return Finding("clipping", verdict, summary, len(flagged) / len(photos), threshold, advice, remarks)
 
