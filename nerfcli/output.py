@@ -38,7 +38,10 @@ class Output:
             return False
         if is_same():
             return True
-        raise UserError(f"{path} exists", "add --overwrite to replace it, or choose another folder with -o")
+        raise UserError(
+            f"{path} exists, made from other files or with other settings",
+            "add --overwrite to replace it, or choose another folder with -o",
+        )
 
     def refuse_existing(self, *paths: Path) -> None:
         """Refuse files if one of them is there and may not be replaced.

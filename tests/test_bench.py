@@ -187,7 +187,10 @@ def test_a_bench_of_a_run_writes_table_csv_json_and_plot_and_is_kept(foggy, sphe
     assert "is complete" in again.stderr
     for other in (("bench", spheres.root, *line[2:]), (*line, "--budget", "50s"), (*line, "--threads", "1")):
         error, hint = error_of(nerfcli(*other))
-        assert (error, "--overwrite" in hint) == (f"Error: {folder / 'bench.json'} exists", True)
+        assert (error, "--overwrite" in hint) == (
+            f"Error: {folder / 'bench.json'} exists, made from other files or with other settings",
+            True,
+        )
     assert json.loads((folder / "bench.json").read_text()) == content
     with files_of_at_most(100):
         result = nerfcli(*line, "--overwrite")

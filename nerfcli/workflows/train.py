@@ -222,7 +222,8 @@ def _keeps(task: _Task) -> bool:
         if run.is_trained_from(scene, settings) and run.is_complete(settings):
             return True
         raise UserError(
-            f"{path} exists", "add --resume to continue, --overwrite to replace it, or choose another folder with -o"
+            f"{path} exists, and is not a complete training with these settings",
+            "add --resume to continue, --overwrite to replace it, or choose another folder with -o",
         )
     _refuse_others(path)
     return False
