@@ -35,7 +35,7 @@ def bench(
     Of a run: renders its field with other steps, tolerances and numbers of threads. Measures the time per picture
     (median and quartiles of interleaved rounds), peak memory, the error against the held-out photos and, separately,
     against a converged rendering of the same field. Of a scene: trains it with other sizes, batches, seeds and times.
-    Run nothing else meanwhile.
+    Run nothing else on the machine meanwhile.
 
     Writes SOURCE-bench/ with bench.csv, bench.json and a plot, bench.png; after an interruption they hold the results
     so far. The column "fastest" marks the settings that no other beats in both speed and error.

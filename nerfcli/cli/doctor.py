@@ -1,4 +1,4 @@
-"""nerfcli doctor: check photos before any long work."""
+"""nerfcli doctor: check photos before poses and training."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,7 +38,7 @@ def doctor(
     threads: Threads = 0,
     printing: Printing,
 ) -> None:
-    """Check photos for problems before any long work.
+    """Check photos for problems before poses and training.
 
     Checks blur, exposure, duplicates, lenses, overlap, camera movement and moving objects; for a scene, also its
     cameras. Prints a table on stderr and writes a page with thumbnails next to the capture, CAPTURE-doctor.html. Each

@@ -124,7 +124,7 @@ def train(
 
     SCENE is a folder written by `nerfcli poses`, or a file or folder of any other format that `nerfcli convert` reads
     (COLMAP, nerfstudio, instant-ngp, Blender, LLFF, Metashape, ...), with photos on disk; a zip archive of one is
-    unpacked beside the run. The held-out photos are those of the scene, else every 8th photo, or those of --holdout.
+    unpacked beside the run. The held-out photos are those of --holdout, or those of the scene, or else every 8th photo.
     Writes SCENE-run/. Ctrl-C or SIGTERM saves a checkpoint; --resume continues from it.
 
     \b

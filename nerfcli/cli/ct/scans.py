@@ -155,7 +155,7 @@ def doctor(
     require: Gate = None,
     printing: Printing,
 ) -> None:
-    """Check a scan for problems before any long work.
+    """Check a scan for problems before the reconstruction.
 
     Checks I > I0, drift, rings, counts, truncation, directions and number of views, the centre of rotation and beam
     hardening. Prints a table on stderr and writes a page with the sinogram next to the scan, SCAN-doctor.html. Each
