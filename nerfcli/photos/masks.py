@@ -18,7 +18,7 @@ from nerfcli.photos.images import HEIC_SUFFIXES, IMAGE_SUFFIXES, read_image, upr
 _LOSSY_SUFFIXES = frozenset({".jpg", ".jpeg", ".webp"}) | HEIC_SUFFIXES
 _MIDDLE = 128
 _FOLDERS = ("masks", "mask")
-_HINT = "a mask must have the size of its photo; black pixels are ignored"
+_HINT = "resize it to the size of its photo, upright or as stored"
 
 
 def find_mask(name: str, masks: Path) -> Path | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from nerfcli.errors import UserError, listed
+from nerfcli.errors import UserError, listed, several
 from nerfcli.photos.images import read_image
 from nerfcli.photos.masks import find_mask, read_mask
 from nerfcli.poses.input.job import WorkMask, file_key, read_stage, stage_key, write_stage
@@ -119,8 +119,8 @@ def lay_out_masks(
         laid_out = list(readers.map(one, range(len(found))))
     wrong = [text for text in laid_out if isinstance(text, str)]
     if wrong:
-        hint = "masks must have the size of their photos, upright or as stored; black is ignored"
-        raise UserError(f"{len(wrong)} masks have the wrong size: {listed(wrong)}", hint)
+        hint = "resize them to the size of their photos, upright or as stored"
+        raise UserError(f"{several(len(wrong), 'mask has', 'masks have')} the wrong size: {listed(wrong)}", hint)
     without = [name for name, mask in zip(photos.names, found, strict=True) if mask is None]
     if without:
         notify(f"{len(without)} of {len(photos.names)} photos have no mask and are used completely: {listed(without)}")
