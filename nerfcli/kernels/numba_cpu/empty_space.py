@@ -1,6 +1,6 @@
 """Chunks of steps along rays that meet no occupied cell, found by how far blocks of cells are from occupied ones."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -69,19 +69,37 @@ def _nearby_blocks(occupied: Any) -> Any:
     return distance
 
 
-def blocks_of(along: March) -> np.ndarray:
+def _blocks_of(along: March) -> np.ndarray:
     """Return the distances to occupied cells of a march, (B, B, B), made of its cells if it has none."""
     if along.distances is not None:
         return along.distances.numpy()
     return _nearby_blocks(along.occupied.contiguous().numpy().view(np.uint8))
 
 
-def chunks_of(edges: np.ndarray) -> np.ndarray:
-    """Return the middle of each chunk of steps and half of its length, for any jitter, (2, M), M a multiple of WINDOW.
+class EmptySpace(NamedTuple):
+    """Chunks of steps and blocks of cells, as `chunks_near` takes them.
 
     Args:
-        edges: see `March`, padded.
+        chunks: the middle of each chunk and half of its length, for any jitter, (2, M), M a multiple of WINDOW.
+        blocks: distances to occupied cells, (B^3,).
+        side: B.
+        width: of a block in the unit cube.
     """
+
+    chunks: Any
+    blocks: Any
+    side: Any
+    width: Any
+
+
+def empty_space_of(along: March, edges: np.ndarray) -> EmptySpace:
+    """Return the empty space of a march whose edges are those of a `Walk`."""
+    blocks, cells = _blocks_of(along), along.occupied.shape[0]
+    width = np.float32(-(-cells // len(blocks)) / cells)
+    return EmptySpace(_chunks_of(edges), blocks.reshape(-1), np.float32(len(blocks)), width)
+
+
+def _chunks_of(edges: np.ndarray) -> np.ndarray:
     chunks = -(-len(edges) // CHUNK)
     first = np.minimum(np.arange(-(-chunks // WINDOW) * WINDOW) * CHUNK, len(edges) - 1)
     begin, end = edges[first], edges[np.minimum(first + CHUNK + 1, len(edges) - 1)]
@@ -98,10 +116,7 @@ def _place(along: Any, width: Any, count: Any) -> Any:
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def chunks_near(
-    origins: Any, directions: Any, ray: Any, chunks: Any, first: Any, blocks: Any, count: Any, width: Any,
-    contraction: Any, numbers: Any, needed: Any,
-) -> Any:  # fmt: skip
+def chunks_near(walk: Any, space: Any, ray: Any, first: Any, numbers: Any, needed: Any) -> Any:
     """Return in bit i whether the steps of a ray in chunk `first` + i may meet an occupied cell.
 
     The cube around a point that reaches to the nearest occupied block is empty. Coordinates of the unit cube change by
@@ -109,16 +124,15 @@ def chunks_near(
     nearest to the origin.
 
     Args:
-        chunks: of `chunks_of`.
-        blocks, count, width: of `blocks_of`, flat; their number along an axis, and the width of each in the unit cube.
+        walk, space: a `Walk` and its `EmptySpace`.
         numbers, needed: scratch space of WINDOW int32 and WINDOW float32.
     """
     half, quarter, one, two = np.float32(0.5), np.float32(0.25), np.float32(1), np.float32(2)
-    side, found = np.float32(count), 0
-    ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
-    dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+    side, width, contraction, found = space.side, space.width, walk.contraction, 0
+    ox, oy, oz = walk.origins[ray, 0], walk.origins[ray, 1], walk.origins[ray, 2]
+    dx, dy, dz = walk.directions[ray, 0], walk.directions[ray, 1], walk.directions[ray, 2]
     for i in range(WINDOW):  # without branches, so that it is vectorised
-        t, reach = chunks[0, first + i], chunks[1, first + i]
+        t, reach = space.chunks[0, first + i], space.chunks[1, first + i]
         x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
         a, b, c = cube(x, y, z, contraction)
         (a, u), (b, v), (c, w) = _place(a, width, side), _place(b, width, side), _place(c, width, side)
@@ -127,5 +141,5 @@ def chunks_near(
         rate = half if contraction == 0 else (two - one / norm) / norm * quarter
         needed[i] = (reach * rate + _ROUNDING) / width + one - min(u, v, w)
     for i in range(WINDOW):
-        found |= np.int64(not np.float32(blocks[numbers[i]]) > needed[i]) << i
+        found |= np.int64(not np.float32(space.blocks[numbers[i]]) > needed[i]) << i
     return found

@@ -7,7 +7,7 @@ threads ever write the same number.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -124,6 +124,25 @@ dense_corners = _corners(_dense_rows)
 hashed_corners = _corners(_hashed_rows)
 
 
+class Table(NamedTuple):
+    """The table of a hash grid, or its gradient, as compiled loops take it.
+
+    Args:
+        flat: (L * T * F,) float32.
+        rows: T.
+        resolutions: (L,) int32, see `HashGrid`.
+    """
+
+    flat: Any
+    rows: Any
+    resolutions: Any
+
+
+def table_of(table: Tensor, resolutions: tuple[int, ...]) -> Table:
+    """Return a table (L, T, F), which must be contiguous, as compiled loops take it."""
+    return Table(table.view(-1).numpy(), table.shape[1], np.array(resolutions, dtype=np.int32))
+
+
 # Samples in a block: in smaller blocks, a sample's row numbers would be read before the processor has stored them.
 BLOCK = 128
 
@@ -140,11 +159,11 @@ def _fade(widths: Any, first: Any, count: Any, resolution: Any, weight: Any) -> 
 
 @numba.njit(nogil=True, error_model="numpy")
 def _prepare_block(
-    points: Any, stride: Any, widths: Any, first: Any, count: Any, level: Any, resolution: Any, rows: Any, flat: Any,
-    scratch: Any,
-) -> None:  # fmt: skip
+    points: Any, stride: Any, widths: Any, first: Any, count: Any, level: Any, table: Any, scratch: Any
+) -> None:
     """Compute rows and weights of all corners of a block of samples, and prefetch the rows if they are hashed."""
     inside, index, weight = scratch
+    resolution, rows = table.resolutions[level], table.rows
     side = np.int64(resolution) + 1
     if side * side * side <= rows:
         for i in range(0, count, LANES):
@@ -155,7 +174,7 @@ def _prepare_block(
         offset = np.int64(level) * rows * FEATURES
         for corner in range(8):
             for i in range(count):
-                prefetch(flat, offset + np.int64(index[corner * BLOCK + i]) * FEATURES)
+                prefetch(table.flat, offset + np.int64(index[corner * BLOCK + i]) * FEATURES)
     _fade(widths, first, count, resolution, weight)
 
 
@@ -167,29 +186,28 @@ def new_scratch() -> Any:
 
 @numba.njit(nogil=True, error_model="numpy")
 def encode_range(
-    points: Any, stride: Any, widths: Any, first: Any, last: Any, flat: Any, rows: Any, resolutions: Any, scratch: Any,
-    out: Any,
-) -> None:  # fmt: skip
+    points: Any, stride: Any, widths: Any, first: Any, last: Any, table: Any, scratch: Any, out: Any
+) -> None:
     """Encode all levels of samples first up to last into the flat array `out`, with scratch space of `new_scratch`.
 
     Args:
         points: coordinates as from `by_axis`, flattened, with `stride` numbers per axis.
+        table: a `Table`.
     """
     index, weight = scratch[1], scratch[2]
-    width = resolutions.shape[0] * FEATURES
-    for level in range(resolutions.shape[0]):
-        resolution = resolutions[level]
-        if resolution == 0:
+    width = table.resolutions.shape[0] * FEATURES
+    for level in range(table.resolutions.shape[0]):
+        if table.resolutions[level] == 0:
             for i in range(first, last):
                 for feature in range(FEATURES):
                     out[i * width + level * FEATURES + feature] = np.float32(0)
             continue
-        offset = np.int64(level) * rows * FEATURES
+        offset = np.int64(level) * table.rows * FEATURES
         for start in range(first, last, BLOCK):
             count = min(BLOCK, last - start)
-            _prepare_block(points, stride, widths, start, count, level, resolution, rows, flat, scratch)
+            _prepare_block(points, stride, widths, start, count, level, table, scratch)
             for i in range(count):
-                gather_rows(flat, offset, index, weight, i, BLOCK, out, (start + i) * width + level * FEATURES)
+                gather_rows(table.flat, offset, index, weight, i, BLOCK, out, (start + i) * width + level * FEATURES)
 
 
 def by_axis(points: Tensor) -> np.ndarray:
@@ -201,39 +219,37 @@ def by_axis(points: Tensor) -> np.ndarray:
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _encode_forward(points: Any, widths: Any, flat: Any, rows: Any, resolutions: Any, out: Any, threads: Any) -> None:
-    width, stride = resolutions.shape[0] * FEATURES, points.shape[1]
+def _encode_forward(points: Any, widths: Any, table: Any, out: Any, threads: Any) -> None:
+    width, stride = table.resolutions.shape[0] * FEATURES, points.shape[1]
     samples = out.shape[0] // max(width, 1)
     blocks = (samples + BLOCK - 1) // BLOCK
     for thread in numba.prange(threads):
         first = thread * blocks // threads * BLOCK
         last = min((thread + 1) * blocks // threads * BLOCK, samples)
-        encode_range(points.reshape(-1), stride, widths, first, last, flat, rows, resolutions, new_scratch(), out)
+        encode_range(points.reshape(-1), stride, widths, first, last, table, new_scratch(), out)
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _encode_backward(
-    points: Any, widths: Any, gradient: Any, rows: Any, resolutions: Any, flat: Any, threads: Any
-) -> None:
-    width, stride = resolutions.shape[0] * FEATURES, points.shape[1]
+def _encode_backward(points: Any, widths: Any, gradient: Any, table: Any, threads: Any) -> None:
+    """Add the gradient of the encoding to a table, which holds that of the rows."""
+    width, stride = table.resolutions.shape[0] * FEATURES, points.shape[1]
     samples = gradient.shape[0] // max(width, 1)
     for thread in numba.prange(threads):
         scratch = new_scratch()
         index, weight = scratch[1], scratch[2]
-        for level in range(thread, resolutions.shape[0], threads):
-            resolution = resolutions[level]
-            if resolution == 0:
+        for level in range(thread, table.resolutions.shape[0], threads):
+            if table.resolutions[level] == 0:
                 continue
-            offset = np.int64(level) * rows * FEATURES
+            offset = np.int64(level) * table.rows * FEATURES
             column = level * FEATURES
             for first in range(0, samples, BLOCK):
                 count = min(BLOCK, samples - first)
-                _prepare_block(points.reshape(-1), stride, widths, first, count, level, resolution, rows, flat, scratch)
+                _prepare_block(points.reshape(-1), stride, widths, first, count, level, table, scratch)
                 for i in range(count):
                     at = (first + i) * width + column
                     a, b, c, d = gradient[at], gradient[at + 1], gradient[at + 2], gradient[at + 3]
                     if a != 0 or b != 0 or c != 0 or d != 0:  # else nothing depends on this sample
-                        scatter_rows(flat, offset, index, weight, i, BLOCK, gradient, at)
+                        scatter_rows(table.flat, offset, index, weight, i, BLOCK, gradient, at)
 
 
 @numba.njit(nogil=True, error_model="numpy")
@@ -259,10 +275,8 @@ def _slopes(
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _points_backward(
-    points: Any, widths: Any, flat: Any, rows: Any, resolutions: Any, gradient: Any, out: Any, threads: Any
-) -> None:
-    width, stride = resolutions.shape[0] * FEATURES, points.shape[1]
+def _points_backward(points: Any, widths: Any, table: Any, gradient: Any, out: Any, threads: Any) -> None:
+    width, stride = table.resolutions.shape[0] * FEATURES, points.shape[1]
     samples = out.shape[0]
     blocks = (samples + BLOCK - 1) // BLOCK
     for thread in numba.prange(threads):
@@ -270,17 +284,17 @@ def _points_backward(
         end = min((thread + 1) * blocks // threads * BLOCK, samples)
         scratch = new_scratch()
         inside, index, dots = scratch
-        for level in range(resolutions.shape[0]):
-            resolution = resolutions[level]
+        for level in range(table.resolutions.shape[0]):
+            resolution = table.resolutions[level]
             if resolution == 0:
                 continue
-            offset = np.int64(level) * rows * FEATURES
+            offset = np.int64(level) * table.rows * FEATURES
             for first in range(begin, end, BLOCK):
                 count = min(BLOCK, end - first)
-                _prepare_block(points.reshape(-1), stride, widths, first, count, level, resolution, rows, flat, scratch)
+                _prepare_block(points.reshape(-1), stride, widths, first, count, level, table, scratch)
                 for i in range(count):
                     at = (first + i) * width + level * FEATURES
-                    dot_rows(flat, offset, index, dots, i, BLOCK, gradient, at)
+                    dot_rows(table.flat, offset, index, dots, i, BLOCK, gradient, at)
                 _slopes(inside, count, resolution, dots, points, widths, first, out)
 
 
@@ -297,35 +311,27 @@ class _HashEncode(torch.autograd.Function):
     ) -> Tensor:
         points, table = points.detach().contiguous(), table.detach().contiguous()
         widths = points.new_empty(0) if widths is None else widths.detach().contiguous()
-        levels, rows, features = table.shape
-        sides = np.array(resolutions, dtype=np.int32)
         if computed is None:
-            out = torch.empty(len(points), levels * features)
-            _encode_forward(
-                by_axis(points), widths.numpy(), table.view(-1).numpy(), rows, sides, out.view(-1).numpy(),
-                use_threads(),
-            )  # fmt: skip
+            out = torch.empty(len(points), len(table) * FEATURES)
+            laid_out, flat = by_axis(points), out.view(-1).numpy()
+            _encode_forward(laid_out, widths.numpy(), table_of(table, resolutions), flat, use_threads())
         else:
             out = computed.view_as(computed)
         ctx.save_for_backward(points, widths, table if ctx.needs_input_grad[0] else table[:0])
-        ctx.table_shape, ctx.sides, ctx.table_grad = table.shape, sides, table_grad
+        ctx.table_shape, ctx.resolutions, ctx.table_grad = table.shape, resolutions, table_grad
         return out
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None, None]:
         points, widths, table = ctx.saved_tensors
         gradient, laid_out = gradients[0].contiguous().view(-1).numpy(), by_axis(points)
-        rows, of_points, of_table = ctx.table_shape[1], None, None
+        of_points, of_table = None, None
         if ctx.needs_input_grad[0]:
-            of_points = torch.zeros_like(points)
-            flat = table.view(-1).numpy()
-            _points_backward(
-                laid_out, widths.numpy(), flat, rows, ctx.sides, gradient, of_points.numpy(), use_threads()
-            )
+            of_points, rows = torch.zeros_like(points), table_of(table, ctx.resolutions)
+            _points_backward(laid_out, widths.numpy(), rows, gradient, of_points.numpy(), use_threads())
         if ctx.needs_input_grad[1]:
             of_table = torch.zeros(ctx.table_shape) if ctx.table_grad is None else ctx.table_grad
-            flat = of_table.view(-1).numpy()
-            _encode_backward(laid_out, widths.numpy(), gradient, rows, ctx.sides, flat, use_threads())
+            _encode_backward(laid_out, widths.numpy(), gradient, table_of(of_table, ctx.resolutions), use_threads())
         return of_points, of_table if ctx.table_grad is None else None, None, None, None, None
 
 

@@ -7,47 +7,41 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.kernels.contraction import CONTRACTIONS
 from nerfcli.kernels.interface import March, Rays
-from nerfcli.kernels.numba_cpu.rays import CHUNK, cut, look_ahead, padded
+from nerfcli.kernels.numba_cpu.rays import CHUNK, cut, look_ahead, walk_of
 from nerfcli.kernels.numba_cpu.threads import use_threads
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _count(
-    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, side: Any, contraction: Any, counts: Any
-) -> None:
+def _count(walk: Any, counts: Any) -> None:
     """Count the samples of each ray."""
-    intervals = edges.shape[0] - 2 - CHUNK
-    for ray in numba.prange(origins.shape[0]):
+    intervals = walk.edges.shape[0] - 2 - CHUNK
+    for ray in numba.prange(counts.shape[0]):
         places, cells = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32)
         count = 0
         for first in range(0, intervals, CHUNK):
-            look_ahead(origins, directions, edges, jitter, ray, first, side, contraction, places, cells)
+            look_ahead(walk, ray, first, places, cells)
             for i in range(min(CHUNK, intervals - first)):
-                if cells[i] >= 0 and occupied[cells[i]]:
+                if cells[i] >= 0 and walk.occupied[cells[i]]:
                     count += 1
         counts[ray] = count
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _write(
-    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, side: Any, contraction: Any, offsets: Any,
-    starts: Any, ends: Any, coordinates: Any,
-) -> None:  # fmt: skip
+def _write(walk: Any, offsets: Any, starts: Any, ends: Any, coordinates: Any) -> None:
     """Write the samples of each ray, from its offset on."""
-    intervals = edges.shape[0] - 2 - CHUNK
-    for ray in numba.prange(origins.shape[0]):
+    intervals = walk.edges.shape[0] - 2 - CHUNK
+    for ray in numba.prange(offsets.shape[0] - 1):
         places, cells = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32)
         at = offsets[ray]
         for first in range(0, intervals, CHUNK):
             if at == offsets[ray + 1]:
                 break
-            look_ahead(origins, directions, edges, jitter, ray, first, side, contraction, places, cells)
+            look_ahead(walk, ray, first, places, cells)
             for i in range(min(CHUNK, intervals - first)):
-                if cells[i] >= 0 and occupied[cells[i]]:
-                    starts[at] = cut(edges, jitter[ray], first + i)
-                    ends[at] = cut(edges, jitter[ray], first + i + 1)
+                if cells[i] >= 0 and walk.occupied[cells[i]]:
+                    starts[at] = cut(walk, ray, first + i)
+                    ends[at] = cut(walk, ray, first + i + 1)
                     for axis in range(3):
                         coordinates[at, axis] = places[axis * CHUNK + i]
                     at += 1
@@ -79,14 +73,10 @@ def keep_largest(cells: Tensor, coordinates: Tensor, values: Tensor) -> None:
 def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """See `reference.occupied_samples`; float32 on the CPU."""
     use_threads()
-    origins, occupied = rays.origins.contiguous(), along.occupied
-    given = (
-        origins.numpy(), rays.directions.contiguous().numpy(), padded(along.edges), rays.jitter.contiguous().numpy(),
-        occupied.contiguous().view(-1).numpy(), occupied.shape[0], CONTRACTIONS.index(along.contraction),
-    )  # fmt: skip
-    counts = np.zeros(len(origins), np.int64)
-    _count(*given, counts)
+    walk = walk_of(rays, along)
+    counts = np.zeros(len(rays.origins), np.int64)
+    _count(walk, counts)
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     spans, coordinates = torch.empty(2, int(offsets[-1])), torch.empty(int(offsets[-1]), 3)
-    _write(*given, offsets, spans[0].numpy(), spans[1].numpy(), coordinates.numpy())
+    _write(walk, offsets, spans[0].numpy(), spans[1].numpy(), coordinates.numpy())
     return spans[0], spans[1], coordinates, torch.from_numpy(offsets)

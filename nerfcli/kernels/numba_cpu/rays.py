@@ -1,7 +1,7 @@
 """Steps along rays and the cells that they cross: building blocks of `visible`; and `ray_indices`."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -11,6 +11,8 @@ from numba.core import types
 from numba.extending import intrinsic
 from torch import Tensor
 
+from nerfcli.kernels.contraction import CONTRACTIONS
+from nerfcli.kernels.interface import March, Rays
 from nerfcli.kernels.numba_cpu.threads import use_threads
 from nerfcli.kernels.numba_cpu.vector import (
     FLOAT,
@@ -136,30 +138,59 @@ def cube(x: Any, y: Any, z: Any, contraction: Any) -> Any:
 
 
 @numba.njit(inline="always")
-def cut(edges: Any, shift: Any, k: Any) -> Any:
-    """Return the jittered edge number k."""
-    return edges[k] + shift * (edges[k + 1] - edges[k])
+def cut(walk: Any, ray: Any, k: Any) -> Any:
+    """Return the jittered edge number k of a ray."""
+    return walk.edges[k] + walk.jitter[ray] * (walk.edges[k + 1] - walk.edges[k])
+
+
+class Walk(NamedTuple):
+    """Rays and a march through cells, as compiled loops take them.
+
+    Args:
+        origins, directions, jitter: of `Rays`.
+        cones: of `Rays`; (0,) for rays without width.
+        edges: of `March`, followed by the CHUNK copies of the last one that `look_ahead` may read.
+        occupied: of `March`, (G^3,).
+        side: G.
+        contraction: its number in `CONTRACTIONS`.
+    """
+
+    origins: Any
+    directions: Any
+    jitter: Any
+    cones: Any
+    edges: Any
+    occupied: Any
+    side: Any
+    contraction: Any
+
+
+def walk_of(rays: Rays, along: March, *, has_width: bool = False) -> Walk:
+    """Return rays and a march as compiled loops take them; rays have their width only if that is asked for."""
+    edges = along.edges.numpy()
+    cones = rays.cones if has_width and rays.cones is not None else rays.origins.new_empty(0)
+    return Walk(
+        origins=rays.origins.contiguous().numpy(),
+        directions=rays.directions.contiguous().numpy(),
+        jitter=rays.jitter.contiguous().numpy(),
+        cones=cones.contiguous().numpy(),
+        edges=np.concatenate([edges, np.repeat(edges[-1:], CHUNK)]),  # torch pads this in 0.3 ms, not 0.01
+        occupied=along.occupied.contiguous().view(-1).numpy(),
+        side=along.occupied.shape[0],
+        contraction=CONTRACTIONS.index(along.contraction),
+    )
 
 
 @numba.njit(inline="always")
-def look_ahead(
-    origins: Any, directions: Any, edges: Any, jitter: Any, ray: Any, first: Any, side: Any, contraction: Any,
-    places: Any, cells: Any,
-) -> None:  # fmt: skip
+def look_ahead(walk: Any, ray: Any, first: Any, places: Any, cells: Any) -> None:
     """Write coordinates (3 CHUNK,) of the midpoints of CHUNK intervals from `first` on, and their cells, -1 outside.
 
-    `edges` must be `padded`; the caller has to leave out steps beyond the last interval.
+    The caller has to leave out steps beyond the last interval.
     """
-    if contraction == 0:
-        steps_in_cube(origins, directions, ray, edges, jitter[ray], first, side, places, cells)
+    if walk.contraction == 0:
+        steps_in_cube(walk.origins, walk.directions, ray, walk.edges, walk.jitter[ray], first, walk.side, places, cells)
     else:
-        steps_in_ball(origins, directions, ray, edges, jitter[ray], first, side, places, cells)
-
-
-def padded(edges: Tensor) -> np.ndarray:
-    """Return edges followed by the CHUNK copies of the last one that `look_ahead` may read."""
-    values = edges.numpy()
-    return np.concatenate([values, np.repeat(values[-1:], CHUNK)])  # torch pads this in 0.3 ms, not 0.01
+        steps_in_ball(walk.origins, walk.directions, ray, walk.edges, walk.jitter[ray], first, walk.side, places, cells)
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")

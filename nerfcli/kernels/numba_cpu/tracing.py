@@ -20,7 +20,7 @@ from nerfcli.kernels.numba_cpu.hash_grid import encode_range, new_scratch
 from nerfcli.kernels.numba_cpu.networks import OUT, TILE, WIDTH, colour_range, density_tile
 from nerfcli.kernels.numba_cpu.rays import CHUNK
 from nerfcli.kernels.numba_cpu.threads import use_threads
-from nerfcli.kernels.numba_cpu.visible import LANES, ROUND, fill_round, flat_arguments, new_round
+from nerfcli.kernels.numba_cpu.visible import LANES, ROUND, arrays_of, fill_round, new_round
 
 # A sample's colour may be skipped if its weight is at most this fraction of `negligible`, the limit for its ray.
 PART = 1 / 32
@@ -39,10 +39,9 @@ def _add_colours(
 
 @numba.njit(nogil=True, error_model="numpy")
 def _trace(
-    origins: Any, directions: Any, edges: Any, chunks: Any, jitter: Any, occupied: Any, blocks: Any, side: Any,
-    contraction: Any, flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, cones: Any, harmonics: Any,
-    negligible: Any, targets: Any, coming: Any, last_ray: Any, sums: Any, quantiles: Any, colours: Any, unseen: Any,
-    counts: Any, owner: Any, record: Any,
+    walk: Any, space: Any, table: Any, weights: Any, deepest: Any, harmonics: Any, negligible: Any, targets: Any,
+    coming: Any, last_ray: Any, sums: Any, quantiles: Any, colours: Any, unseen: Any, counts: Any, owner: Any,
+    record: Any,
 ) -> Any:  # fmt: skip
     """Trace rays from `coming` up to `last_ray`, adding to their rows of sums, quantiles, colours and unseen weight.
 
@@ -51,11 +50,9 @@ def _trace(
     Returns:
         number of samples written.
     """
-    intervals = edges.shape[0] - 2 - CHUNK
-    (lane_ray, lane_next, lane_depth, lane_near), (places, cells, needed), (sample_lane, sample_span, points) = (
-        new_round()
-    )
-    widths = np.empty(ROUND if cones.shape[0] > 0 else 0, np.float32)
+    intervals = walk.edges.shape[0] - 2 - CHUNK
+    lanes, look, samples = new_round(walk)
+    points = samples.points.reshape(-1)
     encoded = np.empty(ROUND * WIDTH, np.float32)
     scratch = new_scratch()
     x, h = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
@@ -65,24 +62,21 @@ def _trace(
     waiting_ray, waiting_weight = np.empty(TILE, np.int64), np.empty(TILE, np.float64)
     found, keep = 0, len(owner) > 0
     while True:
-        filled, coming = fill_round(
-            origins, directions, edges, chunks, jitter, occupied, blocks, side, contraction, cones, coming, last_ray,
-            lane_ray, lane_next, lane_depth, lane_near, places, cells, needed, sample_lane, sample_span, points, widths,
-        )  # fmt: skip
+        filled, coming = fill_round(walk, space, coming, last_ray, lanes, look, samples)
         if filled == 0:
             break
-        encode_range(points.reshape(-1), ROUND, widths, 0, filled, flat, rows, resolutions, scratch, encoded)
+        encode_range(points, ROUND, samples.widths, 0, filled, table, scratch, encoded)
         for first in range(0, filled, TILE):
             count = min(TILE, filled - first)
             density_tile(encoded, first, weights, h, geometry, density)
             for i in range(count):
-                lane = sample_lane[first + i]
-                if not lane_depth[lane] < deepest:
+                lane = samples.lane[first + i]
+                if not lanes.depth[lane] < deepest:
                     continue
-                ray, start, end = lane_ray[lane], sample_span[first + i, 0], sample_span[first + i, 1]
+                ray, start, end = lanes.ray[lane], samples.span[first + i, 0], samples.span[first + i, 1]
                 length, own = np.float64(end) - np.float64(start), np.float64(density[i])
                 weight = add_interval(sums, ray, np.float64(start), length, own, targets, quantiles)
-                lane_depth[lane] += own * length
+                lanes.depth[lane] += own * length
                 if keep:
                     owner[found] = ray
                     record[found, 0], record[found, 1], record[found, 2] = start, end, density[i]
@@ -100,25 +94,23 @@ def _trace(
                     _add_colours(inputs, waiting, waiting_ray, waiting_weight, weights, x, h, out, channels, colours)
                     waiting = 0
         for lane in range(LANES):
-            if lane_ray[lane] >= 0 and (not lane_depth[lane] < deepest or lane_next[lane] >= intervals):
-                lane_ray[lane] = -1
+            if lanes.ray[lane] >= 0 and (not lanes.depth[lane] < deepest or lanes.next[lane] >= intervals):
+                lanes.ray[lane] = -1
     _add_colours(inputs, waiting, waiting_ray, waiting_weight, weights, x, h, out, channels, colours)
     return found
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _trace_all(
-    origins: Any, directions: Any, edges: Any, chunks: Any, jitter: Any, occupied: Any, blocks: Any, side: Any,
-    contraction: Any, flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, cones: Any, harmonics: Any,
-    negligible: Any, targets: Any, borders: Any, sums: Any, quantiles: Any, colours: Any, unseen: Any, counts: Any,
-    owner: Any, record: Any, found: Any,
+    walk: Any, space: Any, table: Any, weights: Any, deepest: Any, harmonics: Any, negligible: Any, targets: Any,
+    borders: Any, sums: Any, quantiles: Any, colours: Any, unseen: Any, counts: Any, owner: Any, record: Any,
+    found: Any,
 ) -> None:  # fmt: skip
     """Call `_trace` in parallel, with one thread for the rays from each border to the next."""
     for thread in numba.prange(len(borders) - 1):
         found[thread] = _trace(
-            origins, directions, edges, chunks, jitter, occupied, blocks, side, contraction, flat, rows, resolutions,
-            weights, deepest, cones, harmonics, negligible, targets, borders[thread], borders[thread + 1], sums,
-            quantiles, colours, unseen, counts, owner[thread], record[thread],
+            walk, space, table, weights, deepest, harmonics, negligible, targets, borders[thread],
+            borders[thread + 1], sums, quantiles, colours, unseen, counts, owner[thread], record[thread],
         )  # fmt: skip
 
 
@@ -146,7 +138,6 @@ def trace_rays(
 ) -> RaysSeen:
     """See `Backend.trace_rays`; float32 on the CPU."""
     threads, count, intervals = use_threads(), len(rays.origins), len(along.edges) - 2
-    cones = rays.cones if grid.antialias and rays.cones is not None else rays.origins.new_empty(0)
     borders = np.arange(threads + 1) * count // threads
     # Room for all samples of all rays: the system allocates memory only when it is first written to.
     room = (threads, -(-count // threads) * intervals if keep_intervals else 0)
@@ -155,13 +146,7 @@ def trace_rays(
     sums, quantiles, targets = new_sums(count, fractions)
     colours, unseen = np.zeros((count, 3)), np.zeros(count)
     harmonics = spherical_harmonics(rays.directions, grid.view_degree).contiguous().numpy()
-    given = (
-        *flat_arguments(rays, along, grid, grid.layers),
-        cones.contiguous().numpy(),
-        harmonics,
-        negligible,
-        targets,
-    )
+    given = (*arrays_of(rays, along, grid, grid.layers), along.max_optical_depth, harmonics, negligible, targets)
     _trace_all(*(*given, borders, sums, quantiles, colours, unseen, counts, owner, record, found))
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     spans = torch.empty(3, int(offsets[-1]))

@@ -5,19 +5,18 @@ encoding and network get full tiles although rays stop at different depths; when
 lane. Except for those few samples, nothing behind a surface is computed.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 import torch
 
-from nerfcli.kernels.contraction import CONTRACTIONS
 from nerfcli.kernels.interface import OUT, WIDTH, HashGrid, March, Rays, Samples
-from nerfcli.kernels.numba_cpu.empty_space import WINDOW, blocks_of, chunks_near, chunks_of
-from nerfcli.kernels.numba_cpu.hash_grid import encode_range, new_scratch
+from nerfcli.kernels.numba_cpu.empty_space import WINDOW, chunks_near, empty_space_of
+from nerfcli.kernels.numba_cpu.hash_grid import encode_range, new_scratch, table_of
 from nerfcli.kernels.numba_cpu.marching import keep_largest
 from nerfcli.kernels.numba_cpu.networks import TILE, density_range, flat_weights
-from nerfcli.kernels.numba_cpu.rays import CHUNK, cut, look_ahead, padded
+from nerfcli.kernels.numba_cpu.rays import CHUNK, cut, look_ahead, walk_of
 from nerfcli.kernels.numba_cpu.threads import use_threads
 
 # Rays that a thread works on at a time, and samples that each of them looks ahead.
@@ -30,96 +29,119 @@ USUAL_SAMPLES = 2**19
 
 
 @numba.njit(inline="always")
-def _stretch(origins: Any, directions: Any, ray: Any, t: Any, contraction: Any) -> Any:
+def _stretch(walk: Any, ray: Any, t: Any) -> Any:
     """Return the factor that `contraction.cube_widths` applies to widths at distance t along a ray."""
     quarter, one, two = np.float32(0.25), np.float32(1), np.float32(2)
-    if contraction == 0:
+    if walk.contraction == 0:
         return np.float32(0.5)
-    x, y = origins[ray, 0] + directions[ray, 0] * t, origins[ray, 1] + directions[ray, 1] * t
-    z = origins[ray, 2] + directions[ray, 2] * t
+    x = walk.origins[ray, 0] + walk.directions[ray, 0] * t
+    y = walk.origins[ray, 1] + walk.directions[ray, 1] * t
+    z = walk.origins[ray, 2] + walk.directions[ray, 2] * t
     norm = np.sqrt(max(x * x + y * y + z * z, one))
     return (two - one / norm) / norm * quarter
 
 
+class Lanes(NamedTuple):
+    """The rays that a thread works on, (LANES,) each.
+
+    Args:
+        ray: -1 for none.
+        next: the interval that comes next.
+        depth: the optical depth so far.
+        near: the number of the window of chunks in which a ray is, and the bits of its `chunks_near`.
+    """
+
+    ray: Any
+    next: Any
+    depth: Any
+    near: Any
+
+
+class Round(NamedTuple):
+    """Samples of a `fill_round`: lane (ROUND,), start and end (ROUND, 2), coordinates (3, ROUND), width (ROUND,)."""
+
+    lane: Any
+    span: Any
+    points: Any
+    widths: Any
+
+
 @numba.njit(inline="always")
-def new_round() -> Any:
+def new_round(walk: Any) -> Any:
     """Return lanes without rays, scratch space for looking ahead, and room for the samples of a `fill_round`."""
-    lanes = np.full(LANES, -1, np.int64), np.zeros(LANES, np.int64), np.zeros(LANES), np.zeros(LANES, np.int64)
+    lanes = Lanes(np.full(LANES, -1, np.int64), np.zeros(LANES, np.int64), np.zeros(LANES), np.zeros(LANES, np.int64))
     look = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32), np.empty(WINDOW, np.float32)
-    samples = np.empty(ROUND, np.int64), np.empty((ROUND, 2), np.float32), np.empty((3, ROUND), np.float32)
-    return lanes, look, samples
+    widths = np.empty(ROUND if walk.cones.shape[0] > 0 else 0, np.float32)
+    return (
+        lanes,
+        look,
+        Round(np.empty(ROUND, np.int64), np.empty((ROUND, 2), np.float32), np.empty((3, ROUND), np.float32), widths),
+    )
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def fill_round(
-    origins: Any, directions: Any, edges: Any, chunks: Any, jitter: Any, occupied: Any, blocks: Any, side: Any,
-    contraction: Any, cones: Any, coming: Any, last_ray: Any, lane_ray: Any, lane_next: Any, lane_depth: Any,
-    lane_near: Any, places: Any, cells: Any, needed: Any, sample_lane: Any, sample_span: Any, points: Any, widths: Any,
-) -> Any:  # fmt: skip
+def fill_round(walk: Any, space: Any, coming: Any, last_ray: Any, lanes: Any, look: Any, samples: Any) -> Any:
     """Find the next samples of the rays in the lanes, up to AHEAD each; a lane without a ray takes the ray `coming`.
 
-    `lane_near` holds the number of the window of chunks in which a lane is, and the bits of its `chunks_near`.
-    A sample's lane, start and end, coordinates and width are written to the last four arrays.
+    Args:
+        walk, space: a `Walk` and its `EmptySpace`.
+        lanes, look, samples: of `new_round`; the samples are written to the last.
 
     Returns:
         number of samples found, and the ray that the next empty lane takes.
     """
-    intervals = edges.shape[0] - 2 - CHUNK
-    flat_blocks, width = blocks.reshape(-1), np.float32(-(-side // blocks.shape[0]) / side)
+    intervals = walk.edges.shape[0] - 2 - CHUNK
+    places, cells, needed = look
     filled = 0
     for lane in range(LANES):
         taken = 0
         while taken == 0:
-            if lane_ray[lane] < 0:
+            if lanes.ray[lane] < 0:
                 if coming == last_ray:
                     break
-                lane_ray[lane], lane_next[lane], lane_depth[lane], lane_near[lane] = coming, 0, 0.0, -1
+                lanes.ray[lane], lanes.next[lane], lanes.depth[lane], lanes.near[lane] = coming, 0, 0.0, -1
                 coming += 1
-            ray, k = lane_ray[lane], lane_next[lane]
+            ray, k = lanes.ray[lane], lanes.next[lane]
             while k < intervals and taken == 0:
                 chunk = k // CHUNK
                 window = chunk // WINDOW
-                if lane_near[lane] >> WINDOW != window:
-                    near = chunks_near(
-                        origins, directions, ray, chunks, window * WINDOW, flat_blocks, blocks.shape[0], width,
-                        contraction, cells, needed,
-                    )  # fmt: skip
-                    lane_near[lane] = window << WINDOW | near
-                near = lane_near[lane]
+                if lanes.near[lane] >> WINDOW != window:
+                    near = chunks_near(walk, space, ray, window * WINDOW, cells, needed)
+                    lanes.near[lane] = window << WINDOW | near
+                near = lanes.near[lane]
                 while chunk // WINDOW == window and not near >> chunk % WINDOW & 1:
                     chunk += 1
                 if chunk > k // CHUNK:
                     k = chunk * CHUNK
                     continue
-                look_ahead(origins, directions, edges, jitter, ray, k, side, contraction, places, cells)
+                look_ahead(walk, ray, k, places, cells)
                 past = min(CHUNK, intervals - k)
                 for i in range(past):
-                    if cells[i] >= 0 and occupied[cells[i]]:
-                        sample_lane[filled] = lane
-                        sample_span[filled, 0] = cut(edges, jitter[ray], k + i)
-                        sample_span[filled, 1] = cut(edges, jitter[ray], k + i + 1)
+                    if cells[i] >= 0 and walk.occupied[cells[i]]:
+                        samples.lane[filled] = lane
+                        samples.span[filled, 0] = cut(walk, ray, k + i)
+                        samples.span[filled, 1] = cut(walk, ray, k + i + 1)
                         for axis in range(3):
-                            points[axis, filled] = places[axis * CHUNK + i]
-                        if cones.shape[0] > 0:
-                            t = (sample_span[filled, 0] + sample_span[filled, 1]) * np.float32(0.5)
-                            widths[filled] = cones[ray] * t * _stretch(origins, directions, ray, t, contraction)
+                            samples.points[axis, filled] = places[axis * CHUNK + i]
+                        if walk.cones.shape[0] > 0:
+                            t = (samples.span[filled, 0] + samples.span[filled, 1]) * np.float32(0.5)
+                            samples.widths[filled] = walk.cones[ray] * t * _stretch(walk, ray, t)
                         filled += 1
                         taken += 1
                         if taken == AHEAD:
                             past = i + 1
                             break
                 k += past
-            lane_next[lane] = k
+            lanes.next[lane] = k
             if taken == 0:
-                lane_ray[lane] = -1
+                lanes.ray[lane] = -1
     return filled, coming
 
 
 @numba.njit(nogil=True, error_model="numpy")
 def _follow(
-    origins: Any, directions: Any, edges: Any, chunks: Any, jitter: Any, occupied: Any, blocks: Any, side: Any,
-    contraction: Any, flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, least: Any, cones: Any,
-    coming: Any, last_ray: Any, counts: Any, owner: Any, record: Any, code: Any, left: Any,
+    walk: Any, space: Any, table: Any, weights: Any, deepest: Any, least: Any, coming: Any, last_ray: Any, counts: Any,
+    owner: Any, record: Any, code: Any, left: Any,
 ) -> Any:  # fmt: skip
     """Write the samples of rays from `coming` up to `last_ray`, in the order in which they are found.
 
@@ -127,11 +149,9 @@ def _follow(
     is left out for its weight, its coordinates and optical depth go to `left` instead. Returns the number of both, the
     first -1 if there is not enough room.
     """
-    intervals = edges.shape[0] - 2 - CHUNK
-    (lane_ray, lane_next, lane_depth, lane_near), (places, cells, needed), (sample_lane, sample_span, points) = (
-        new_round()
-    )
-    widths = np.empty(ROUND if cones.shape[0] > 0 else 0, np.float32)
+    intervals = walk.edges.shape[0] - 2 - CHUNK
+    lanes, look, samples = new_round(walk)
+    points = samples.points.reshape(-1)
     encoded = np.empty((ROUND, WIDTH), np.float32)
     density = np.empty(ROUND, np.float32)
     scratch = new_scratch()
@@ -139,57 +159,51 @@ def _follow(
     geometry = np.empty(TILE * OUT, np.float32)
     found = missing = 0
     while True:
-        filled, coming = fill_round(
-            origins, directions, edges, chunks, jitter, occupied, blocks, side, contraction, cones, coming, last_ray,
-            lane_ray, lane_next, lane_depth, lane_near, places, cells, needed, sample_lane, sample_span, points, widths,
-        )  # fmt: skip
+        filled, coming = fill_round(walk, space, coming, last_ray, lanes, look, samples)
         if filled == 0:
             return found, missing
         if max(found, missing) + filled > len(owner):
             return -1, missing
-        encode_range(
-            points.reshape(-1), ROUND, widths, 0, filled, flat, rows, resolutions, scratch, encoded.reshape(-1)
-        )
+        encode_range(points, ROUND, samples.widths, 0, filled, table, scratch, encoded.reshape(-1))
         density_range(encoded, 0, filled, weights, x, h, geometry, density)
         for i in range(filled):
-            lane = sample_lane[i]
-            before = lane_depth[lane]
+            lane = samples.lane[i]
+            before = lanes.depth[lane]
             if not before < deepest:
                 continue
-            own = np.float64(density[i]) * np.float64(sample_span[i, 1] - sample_span[i, 0])
-            lane_depth[lane] += own
+            start, end = samples.span[i, 0], samples.span[i, 1]
+            own = np.float64(density[i]) * np.float64(end - start)
+            lanes.depth[lane] += own
             if not (own < least or own * np.exp(-before) < least):  # most faint samples need no exponential
-                ray = lane_ray[lane]
+                ray = lanes.ray[lane]
                 counts[ray] += 1
                 owner[found] = ray
-                record[found, 0], record[found, 1], record[found, 2] = sample_span[i, 0], sample_span[i, 1], density[i]
+                record[found, 0], record[found, 1], record[found, 2] = start, end, density[i]
                 for axis in range(3):
-                    record[found, 3 + axis] = points[axis, i]
+                    record[found, 3 + axis] = samples.points[axis, i]
                 for feature in range(WIDTH):
                     code[found, feature] = encoded[i, feature]
                 found += 1
             else:
                 for axis in range(3):
-                    left[missing, axis] = points[axis, i]
+                    left[missing, axis] = samples.points[axis, i]
                 left[missing, 3] = own
                 missing += 1
         for lane in range(LANES):
-            if lane_ray[lane] >= 0 and (lane_depth[lane] >= deepest or lane_next[lane] >= intervals):
-                lane_ray[lane] = -1
+            if lanes.ray[lane] >= 0 and (lanes.depth[lane] >= deepest or lanes.next[lane] >= intervals):
+                lanes.ray[lane] = -1
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _visible(
-    origins: Any, directions: Any, edges: Any, chunks: Any, jitter: Any, occupied: Any, blocks: Any, side: Any,
-    contraction: Any, flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, least: Any, cones: Any,
-    borders: Any, counts: Any, owner: Any, record: Any, code: Any, left: Any, found: Any, missing: Any,
+    walk: Any, space: Any, table: Any, weights: Any, deepest: Any, least: Any, borders: Any, counts: Any, owner: Any,
+    record: Any, code: Any, left: Any, found: Any, missing: Any,
 ) -> None:  # fmt: skip
     """Call `_follow` in parallel, with one thread for the rays from each border to the next."""
     counts[:] = 0
     for thread in numba.prange(len(borders) - 1):
         found[thread], missing[thread] = _follow(
-            origins, directions, edges, chunks, jitter, occupied, blocks, side, contraction, flat, rows,
-            resolutions, weights, deepest, least, cones, borders[thread], borders[thread + 1], counts, owner[thread],
+            walk, space, table, weights, deepest, least, borders[thread], borders[thread + 1], counts, owner[thread],
             record[thread], code[thread], left[thread],
         )  # fmt: skip
 
@@ -213,22 +227,17 @@ def _sort(
                 encoded[to, feature] = code[thread, i, feature]
 
 
-def flat_arguments(rays: Rays, along: March, grid: HashGrid, layers: tuple[torch.Tensor, ...]) -> tuple[Any, ...]:
-    """Return rays, occupied cells, table and layers as the arrays that `_follow` takes, up to `deepest`."""
-    edges = padded(along.edges)
-    return (
-        rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy(), edges, chunks_of(edges),
-        rays.jitter.numpy(), along.occupied.contiguous().view(-1).numpy(), blocks_of(along),
-        along.occupied.shape[0], CONTRACTIONS.index(along.contraction),
-        grid.table.detach().contiguous().view(-1).numpy(), grid.table.shape[1],
-        np.array(grid.resolutions, dtype=np.int32), flat_weights(layers), along.max_optical_depth,
-    )  # fmt: skip
+def arrays_of(rays: Rays, along: March, grid: HashGrid, layers: tuple[torch.Tensor, ...]) -> tuple[Any, ...]:
+    """Return rays, empty space, table and layers as `_follow` takes them."""
+    walk = walk_of(rays, along, has_width=grid.antialias)
+    table = table_of(grid.table.detach().contiguous(), grid.resolutions)
+    return walk, empty_space_of(along, walk.edges), table, flat_weights(layers)
 
 
 def visible_samples(rays: Rays, along: March, grid: HashGrid, cell_depths: torch.Tensor | None = None) -> Samples:
     """See `reference.visible_samples`; float32 on the CPU."""
     threads, count, intervals = use_threads(), len(rays.origins), len(along.edges) - 2
-    cones = rays.cones if grid.antialias and rays.cones is not None else rays.origins.new_empty(0)
+    given = (*arrays_of(rays, along, grid, grid.layers[:2]), along.max_optical_depth, along.least_weight)
     borders = np.arange(threads + 1) * count // threads
     counts, (found, missing) = np.empty(count, np.int64), np.empty((2, threads), np.int64)
     most = -(-count // threads) * intervals
@@ -236,7 +245,6 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid, cell_depths: torch
         room = (threads, samples)
         owner, record = np.empty(room, np.int64), np.empty((*room, 6), np.float32)
         code, left = np.empty((*room, WIDTH), np.float32), np.empty((*room, 4), np.float32)
-        given = (*flat_arguments(rays, along, grid, grid.layers[:2]), along.least_weight, cones.contiguous().numpy())
         _visible(*(*given, borders, counts, owner, record, code, left, found, missing))
         if (found >= 0).all():
             break
