@@ -99,6 +99,24 @@ def test_disks_of_a_box_lie_flat_on_its_faces_in_the_colours_of_the_photos():
     assert np.median(sizes[plain]) > 3 * np.median(sizes[waves])
 
 
+def test_pictures_of_the_field_add_what_no_photo_shows_in_their_own_brightness():
+    photos = photos_of_box(lambda places: np.full_like(places, 0.6))
+    pictures = photos_of_box(lambda places: np.full_like(places, 0.5))
+    one, others = photos[:1], pictures[3:6]
+    alone = gaussians_of_field(dense_box(), one, count=4000, degree=1, with_gains=True)
+    result = gaussians_of_field(dense_box(), one, others, count=4000, degree=1, with_gains=True)
+    np.testing.assert_array_equal(result.log_gains, alone.log_gains)  # one photo, so one gain
+    assert result.log_gains.shape == (1, 3)
+    # The photo looks along -x: the face at x = -1/2 is behind the box.
+    behind = [
+        begun_with.gaussians.moved(TRAINING_FROM_SCENE).means[:, 0] < -HALF + 0.01 for begun_with in (alone, result)
+    ]
+    assert behind[0].sum() == 0
+    assert behind[1].sum() > 20
+    # The photo's gain takes its 0.6 to the field's 0.5; the pictures are 0.5 as they are.
+    np.testing.assert_allclose(shown(result.gaussians), 0.5, atol=0.01)
+
+
 @pytest.mark.parametrize("count", [1, 30, 400])
 def test_there_are_no_more_disks_than_asked_for_and_nearly_as_many(count):
     disks = begun(dense_box(), photos_of_box(), count=count).gaussians

@@ -1,4 +1,4 @@
-"""The first Gaussians: flat disks on the surfaces that a trained field shows to the cameras of its photos.
+"""The first Gaussians: flat disks on the surfaces that a field shows from and near its photos.
 
 Detail decides where they are: a picture is cut into squares of 1 to 16 pixels, as large as photo and depth allow, and
 each square asks for one disk. Of the squares that photos put at the same place, the smallest is kept.
@@ -89,6 +89,7 @@ def count_for(photos: Sequence[LoadedPhoto], *, core_seconds: float) -> int:
 def gaussians_of_field(
     model: Model,
     photos: Sequence[LoadedPhoto],
+    pictures: Sequence[LoadedPhoto] = (),
     *,
     count: int,
     degree: int,
@@ -99,17 +100,20 @@ def gaussians_of_field(
 
     Args:
         photos: the training photos, as the field was trained on them.
+        pictures: of the field, from cameras that also see what no photo shows.
         degree: of the harmonics, 0 to 3; those above the constant are 0.
         with_gains: whether the field was trained with exposures of photos; if not, their gains are 1.
         on_progress: called with the fraction of the maps that is done.
     """
-    maps = field_maps(model, photos, count=count, on_progress=on_progress)
+    views = [*photos, *pictures]
+    maps = field_maps(model, views, count=count, on_progress=on_progress)
     log_gains = log_gains_of_photos(model, photos) if with_gains else np.zeros((len(photos), 3))
+    gains = np.concatenate([log_gains, np.zeros((len(pictures), 3))])
     behind, scene_from_training = model.background, model.training_from_scene.inverse()
     alpha = any(photo.pixels.shape[-1] == 4 for photo in photos)
     surrounded = not alpha and (model.contraction != "none" or isinstance(behind, SphereBackground))
     squares = _joined(
-        [_squares_of_map(model, photos[i], seen, log_gains[i], surrounded=surrounded) for i, seen in maps.items()]
+        [_squares_of_map(model, views[i], seen, gains[i], surrounded=surrounded) for i, seen in maps.items()]
     )
     if not isinstance(behind, SphereBackground):
         disks = _disks(_chosen(squares, count), degree, SPREAD, OPACITY)

@@ -41,8 +41,8 @@ FORMAT = "nerfcli splat file 1"
 COMPARED = 8
 # Splats that are this much below the field on training photos should be refined for longer.
 BELOW_DB = 1.0
-# Fractions of the progress bar at which the depths of the training photos are known, and the refinement begins.
-_MAPS, _START = 0.08, 0.1
+# Fractions of the progress bar at which the pictures of the field are rendered, and the refinement begins.
+_PICTURES, _START = 0.02, 0.1
 
 
 @dataclass(frozen=True)
@@ -155,11 +155,11 @@ def run_splats(run: Run, model: Model, *, settings: SplatSettings, reporter: Rep
     loaded = load_photos(
         run.cameras.train, factor=run.config.downscale, threads=torch.get_num_threads(), masks=run.components.masks
     )
-    splats = kept or _started(run, model, loaded, settings=settings, reporter=reporter)
-    began = splats.refinement.seconds / settings.budget_seconds
     pictures = pictures_beside(
-        model, loaded, on_progress=reporter.part(_MAPS, _START, f"pictures of the field, {_before(settings)}")
+        model, loaded, on_progress=reporter.part(0.0, _PICTURES, f"pictures of the field, {_before(settings)}")
     )
+    splats = kept or _started(run, model, loaded, pictures, settings=settings, reporter=reporter)
+    began = splats.refinement.seconds / settings.budget_seconds
     frame = {"splats_from_scene": model.training_from_scene, "near": near_of(splats.refinement.rows[:, :3])}
 
     def on_step(fraction: float) -> None:
@@ -216,7 +216,13 @@ def _kept(run: Run, model: Model, settings: SplatSettings) -> RunSplats | None:
 
 
 def _started(
-    run: Run, model: Model, loaded: Sequence[LoadedPhoto], *, settings: SplatSettings, reporter: Reporter
+    run: Run,
+    model: Model,
+    loaded: Sequence[LoadedPhoto],
+    pictures: Sequence[LoadedPhoto],
+    *,
+    settings: SplatSettings,
+    reporter: Reporter,
 ) -> RunSplats:
     """Return the first splats of a field."""
     core_seconds = settings.budget_seconds * torch.get_num_threads()
@@ -224,10 +230,11 @@ def _started(
     start = gaussians_of_field(
         model,
         loaded,
+        pictures,
         count=count,
         degree=settings.degree,
         with_gains=run.components.exposure != "none",
-        on_progress=reporter.part(0.0, _MAPS, f"depths of the training photos, {_before(settings)}"),
+        on_progress=reporter.part(_PICTURES, _START, f"depths of the training photos, {_before(settings)}"),
     )
     rows = rows_of(start.gaussians.moved(model.training_from_scene))
     assert model.sha256 is not None
