@@ -127,8 +127,14 @@ def read_sound_scan(folder: Path) -> None:
     assert np.isfinite(scan.line_integrals(np.arange(scan.geometry.views))).all()
 
 
+# Half of the damage to these changes a digit, which gives another sound number. Which damage that is depends on the last
+# digits of the sample, and these on the processor: 74 and 77 of 150 are refused on a Xeon.
+MOSTLY_DIGITS = ("colmap-text", "kapture")
 SAMPLES: dict[str, Sample] = {
-    **{name: Sample(partial(write, VIEWS), partial(read_capture, None)) for name, write in WITH_PHOTOS.items()},
+    **{
+        name: Sample(partial(write, VIEWS), partial(read_capture, None), 0.4 if name in MOSTLY_DIGITS else 0.5)
+        for name, write in WITH_PHOTOS.items()
+    },
     "colmap with points": Sample(partial(rich, "colmap", "sparse/0"), partial(read_capture, None)),
     "colmap-text with points": Sample(partial(rich, "colmap-text", "sparse/0"), partial(read_capture, None)),
     "transforms with points": Sample(partial(rich, "transforms", "transforms.json"), partial(read_capture, None)),
