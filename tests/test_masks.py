@@ -103,9 +103,11 @@ def test_masks_that_do_not_fit_are_named(photos, masks, tmp_path):
     write_png(masks / "p 0.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
     write_png(masks / "p 1.png", np.full((HEIGHT, WIDTH - 1), 255, np.uint8))
     write_png(masks / "p 3.png", np.full((WIDTH, HEIGHT), 255, np.uint8))  # the photo is stored upright: not turned
-    with pytest.raises(
-        UserError, match=r"2 masks have the wrong size: .*p 1\.png is 119x80, but its photo is 120x80, .*p 3\.png"
-    ):
+    (masks / "p 2.png").write_bytes(b"no picture")
+    said = (
+        r"3 masks cannot be used: .*p 1\.png is 119x80, but its photo is 120x80, .*p 2\.png is not a readable picture"
+    )
+    with pytest.raises(UserError, match=said):
         laid_out(photos, masks, tmp_path / "work")
 
 
@@ -115,7 +117,7 @@ def test_photos_without_a_mask_are_named(photos, masks, tmp_path):
     result, notes = laid_out(photos, masks, tmp_path / "work")
     assert notes == [
         "2 of 4 photos have no mask and are used completely: p 0.png, p 3.png",
-        "1 masks are completely black, so their photos are not used: p 2.png",
+        "photos whose masks are completely black are not used (1): p 2.png",
     ]
     assert [mask.used_fraction for mask in result] == [1, 1, 0, 1]
     assert [bool(mask.key) for mask in result] == [False, True, True, False]

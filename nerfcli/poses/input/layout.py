@@ -119,15 +119,15 @@ def lay_out_masks(
         laid_out = list(readers.map(one, range(len(found))))
     wrong = [text for text in laid_out if isinstance(text, str)]
     if wrong:
-        hint = "resize them to the size of their photos, upright or as stored"
-        raise UserError(f"{several(len(wrong), 'mask has', 'masks have')} the wrong size: {listed(wrong)}", hint)
+        hint = "use pictures of the size of their photos, upright or as stored; black is ignored"
+        raise UserError(f"{several(len(wrong), 'mask')} cannot be used: {listed(wrong)}", hint)
     without = [name for name, mask in zip(photos.names, found, strict=True) if mask is None]
     if without:
         notify(f"{len(without)} of {len(photos.names)} photos have no mask and are used completely: {listed(without)}")
     done = tuple(mask for mask in laid_out if isinstance(mask, WorkMask))
     hidden = [name for name, mask in zip(photos.names, done, strict=True) if mask.used_fraction == 0]
     if hidden:
-        notify(f"{len(hidden)} masks are completely black, so their photos are not used: {listed(hidden)}")
+        notify(f"photos whose masks are completely black are not used ({len(hidden)}): {listed(hidden)}")
     return done
 
 
