@@ -416,6 +416,17 @@ def test_cameras_at_one_place_and_one_far_off_are_reported():
     assert camera_layout.spread(replace(scene, frames=off)).names == ("5.jpg",)
 
 
+def test_the_depth_of_what_surrounds_a_panorama_is_its_distance():
+    """Half of it is behind the camera: its median along the axis is near 0. Cameras 0.5 off the centre, walls at 4."""
+    directions = np.random.default_rng(0).normal(size=(2000, 3))
+    walls = 4 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    camera = Camera("EQUIRECTANGULAR", 800, 400, (800.0, 400.0))
+    poses = [rigid.from_parts(np.eye(3), 0.5 * direction) for direction in (*np.eye(3), *-np.eye(3))]
+    frames = tuple(Frame(f"{index}.jpg", camera, pose) for index, pose in enumerate(poses))
+    found = camera_layout.spread(Capture(frames, walls, kind="transforms"))
+    assert (found.verdict, found.number) == (GOOD, pytest.approx(0.5 / 4, rel=0.02))
+
+
 def test_weakly_determined_intrinsics_of_a_scene_are_named(tmp_path):
     """As reported by nerfcli poses: weak, firm, and reports without uncertainties."""
     scene = replace(ring(24, span_deg=360), root=tmp_path, kind="nerfcli")

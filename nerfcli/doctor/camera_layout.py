@@ -178,7 +178,7 @@ def gps(photos: Sequence[PhotoFacts]) -> Finding | None:
 
 
 def _depths(scene: Capture) -> np.ndarray:
-    """Return the median depth along the optical axis that each camera sees, (frames,)."""
+    """Return the median depth that each camera sees, (frames,): along the optical axis, of panoramas along the rays."""
     frames = scene.frames
     if scene.depth_bounds is not None:
         # The middle of the range of inverse depths.
@@ -188,9 +188,9 @@ def _depths(scene: Capture) -> np.ndarray:
         points = scene.points[:: 1 + len(scene.points) // _MOST_POINTS]
         for index, frame in enumerate(frames):
             local = rigid.apply(rigid.inverse(frame.world_from_cam), points)
-            inside = frame.camera.shows(local)
-            if inside.any():
-                depths[index] = np.median(local[inside, 2])
+            seen = local[frame.camera.shows(local)]
+            if len(seen):
+                depths[index] = np.median(np.linalg.norm(seen, axis=1) if frame.camera.is_spherical else seen[:, 2])
         if not np.isnan(depths).all():
             return np.where(np.isnan(depths), np.nanmedian(depths), depths)
     to_focus = np.linalg.norm(focus_point(frames) - centres_of(frames), axis=1)
