@@ -443,6 +443,7 @@ def test_weakly_determined_intrinsics_of_a_scene_are_named(tmp_path):
     assert good is not None
     assert bad is not None
     assert (good.verdict, good.number) == (GOOD, 0.2)
+    assert good.threshold.endswith("look from 1 % of the focal length, or 0.3 % of half the image diagonal")
     assert (bad.verdict, bad.number) == (LOOK, 4.0)
     assert "weakly determined: focal length ± 4 %, distortion ± 3 px at the corners" in bad.summary
     assert "--intrinsics" in bad.advice

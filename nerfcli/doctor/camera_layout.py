@@ -15,6 +15,7 @@ from nerfcli.errors import several
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, finding, verdict_below, worst
 from nerfcli.photos.geodesy import east_north_up
 from nerfcli.poses.judge.contradictions import FARTHEST
+from nerfcli.poses.model.lens_observability import HARMLESS, WEAK_FOCAL
 from nerfcli.poses.model.reasons import FEW_FEATURES
 
 # Inward-looking cameras surround the scene if they span at least this angle; otherwise they face its front.
@@ -134,7 +135,10 @@ def intrinsics(scene: Capture) -> Finding | None:
     accuracy = f"focal length ± {focal:.2g} %"
     if borders_px:
         accuracy += f", distortion ± {max(borders_px):.2g} px at the corners"
-    threshold = "standard deviation: look from 1 % of the focal length, or 0.5 % of half the image diagonal"
+    threshold = (
+        f"standard deviation: look from {100 * WEAK_FOCAL:g} % of the focal length, or {100 * HARMLESS:g} % of half "
+        "the image diagonal"
+    )
     summary = f"intrinsics are weakly determined: {accuracy}" if weak else accuracy
     advice = "use nerfcli poses --intrinsics, or add photos from more directions and distances"
     return finding("intrinsics", LOOK if weak else GOOD, summary, focal, threshold, advice=advice)

@@ -33,14 +33,14 @@ from nerfcli.poses.model.lens_evidence import (
 _CHANCE = 5e-4
 # If the standard deviation of the distortion term moves the corner by less than this fraction of its distance from the
 # centre, the term is harmless, and may be free without being significant; a lens is weakly determined beyond it.
-_HARMLESS = 0.003
+HARMLESS = 0.003
 # Relative standard deviation of a focal length by EXIF, and of an unknown one, between a fisheye and a small telephoto
 # lens; the deviation above which a focal length without EXIF is held; and those above which focal length and distortion
 # (at the corner) are reported as weak.
 _EXIF_DEVIATION = 0.03
 _UNKNOWN_DEVIATION = 0.35
 _OPEN_DEVIATION = 0.05
-_WEAK_FOCAL = 0.01
+WEAK_FOCAL = 0.01
 # A principal point farther than this from the centre, as a fraction of the size, is a fit to something else.
 PRINCIPAL_POINT_RANGE = 0.1
 
@@ -192,20 +192,20 @@ def uncertainty(
         return nothing | {"reason": str(error)}
     focal = found.deviation("f") / camera.mean_focal_length()
     border = max((_border_px(evidence, found, name) for name in free if name[0] in "kp"), default=None)
-    harmless = _HARMLESS * np.hypot(camera.width, camera.height) / 2
+    harmless = HARMLESS * np.hypot(camera.width, camera.height) / 2
     return {
         "focal_percent": 100 * focal,
         "principal_point_px": [freed.deviation(name) for name in _PRINCIPAL_POINT],
         "distortion_border_px": border,
         "principal_point_free": principal_point,
-        "weak": bool(focal > _WEAK_FOCAL or (border is not None and border > harmless)),
+        "weak": bool(focal > WEAK_FOCAL or (border is not None and border > harmless)),
         "reason": None,
     }
 
 
 def focal_is_determined(found: Mapping[str, Any]) -> bool:
     """Return whether an `uncertainty` knows the focal length to 1 % (one standard deviation)."""
-    return found["focal_percent"] is not None and found["focal_percent"] < 100 * _WEAK_FOCAL
+    return found["focal_percent"] is not None and found["focal_percent"] < 100 * WEAK_FOCAL
 
 
 def is_centred(camera: pycolmap.Camera) -> bool:
@@ -261,7 +261,7 @@ def has_open_distortion(model: pycolmap.Reconstruction, camera_id: int, solver: 
 
 
 def _is_harmless(evidence: LensEvidence, found: Estimate, camera: pycolmap.Camera) -> bool:
-    return _border_px(evidence, found, "k1") < _HARMLESS * float(np.hypot(camera.width, camera.height)) / 2
+    return _border_px(evidence, found, "k1") < HARMLESS * float(np.hypot(camera.width, camera.height)) / 2
 
 
 def _border_px(evidence: LensEvidence, found: Estimate, name: str) -> float:
