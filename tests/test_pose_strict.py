@@ -13,9 +13,10 @@ from test_poses import FAST
 from nerfcli.cameras.alignment import align
 from nerfcli.captures.loading import load_scene
 from nerfcli.evaluate.ledger import leak_ledger
-from nerfcli.poses.engine.strict import fingerprint, move_held_out_last, training_part
+from nerfcli.poses.engine.strict import fingerprint, move_held_out_last, place_held_out, training_part
 from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.poses.model.reasons import NO_MODEL, dominant
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.workspace import is_same_scene
 from nerfcli.training.runs.run import RunConfig
@@ -84,8 +85,9 @@ def test_the_fingerprint_sees_the_last_bit(solved):
     assert fingerprint(model) != before
 
 
-def test_the_training_part_keeps_files_cameras_and_pairs_together():
-    job = Job(
+def job_of_five() -> Job:
+    """The second and third photos are held out."""
+    return Job(
         folder="work",
         files=("00000.jpg", "00003.jpg", "00004.jpg", "00007.jpg", "00008.jpg"),
         originals="photos",
@@ -104,7 +106,19 @@ def test_the_training_part_keeps_files_cameras_and_pairs_together():
         threads=1,
         held_out=(1, 2),
     )
-    ordered = move_held_out_last(job)
+
+
+def test_a_held_out_photo_is_not_said_to_lack_features_where_no_training_photo_is_placed():
+    training = training_part(job := job_of_five())
+    seen = {"features": 900, "best_matches": 10, "best_partner": "d"}
+    result = {"models": [], "evidence": [seen] * 3, "components": [], "left_out": {}, "pose_blur_px": {}}
+    whole = place_held_out(job, training, result, lambda *progress: None)
+    assert whole["left_out"] == dict.fromkeys(("1", "2"), NO_MODEL)
+    assert "hold out fewer photos" in dominant([NO_MODEL])[1]
+
+
+def test_the_training_part_keeps_files_cameras_and_pairs_together():
+    ordered = move_held_out_last(job_of_five())
     assert [group.model for group in ordered.groups] == ["PINHOLE", "RADIAL", "OPENCV"]
     part = training_part(ordered)
     assert (part.files, part.names, part.keys) == (

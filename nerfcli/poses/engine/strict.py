@@ -20,7 +20,7 @@ from nerfcli.poses.input.job import Job, Report, stage_key
 from nerfcli.poses.model.held_out import MAPPER
 from nerfcli.poses.model.locate import place
 from nerfcli.poses.model.principal_points import LEAST_OBSERVATIONS, camera_of_lens, refine_with_principal_point
-from nerfcli.poses.model.reasons import FEW_MATCHES, NO_TRAINING_PHOTO
+from nerfcli.poses.model.reasons import FEW_MATCHES, NO_MODEL, NO_TRAINING_PHOTO
 
 
 def move_held_out_last(job: Job) -> Job:
@@ -59,7 +59,7 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
     folder = Path(job.folder) / "sparse" / "0"
     whole = _renumbered(job, training, result)
     if not result["models"]:
-        return whole
+        return whole | {"left_out": {str(number): NO_MODEL for number in job.held_out}}
     extract(job, report)
     job = select_pairs(job, report)
     held_out = frozenset(job.held_out)

@@ -11,6 +11,7 @@ FEW_MATCHES = 30
 MIN_MATCHES = 15
 # A held-out photo is placed with the lens that the training photos of its camera gave.
 NO_TRAINING_PHOTO = "its camera took no training photo"
+NO_MODEL = "held out, and no training photo registered"
 
 
 def reason(
@@ -41,6 +42,7 @@ _ADVICE = {
     "contradicts the rest": "take photos with more overlap around this one, or remove it",
     "matches too few points": "hold out photos that overlap with training photos, see --holdout",
     NO_TRAINING_PHOTO: "hold out only photos of cameras that also took training photos, see --holdout",
+    NO_MODEL: "hold out fewer photos, see --holdout, or take photos with more overlap",
     "rejected by the mapper": "take photos with more overlap and while moving sideways, or try --quality best",
 }
 
