@@ -146,5 +146,6 @@ def test_the_dominant_reason_brings_its_advice():
     assert kind == "matches no other photo well"
     assert "overlap" in advice
     assert "--holdout" in dominant([NO_TRAINING_PHOTO])[1]
+    assert "overlap" in dominant(["connected to the rest only through a photo that contradicts it"])[1]
     with pytest.raises(ValueError, match="no reasons"):
         dominant([])

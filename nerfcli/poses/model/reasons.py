@@ -40,6 +40,7 @@ _ADVICE = {
     "matches no other photo well": "take photos with more overlap, two thirds from one to the next",
     "in another model": "take photos that connect the parts of the scene",
     "contradicts the rest": "take photos with more overlap around this one, or remove it",
+    "connected to the rest only through": "take photos with more overlap around that photo",
     "matches too few points": "hold out photos that overlap with training photos, see --holdout",
     NO_TRAINING_PHOTO: "hold out only photos of cameras that also took training photos, see --holdout",
     NO_MODEL: "hold out fewer photos, see --holdout, or take photos with more overlap",
