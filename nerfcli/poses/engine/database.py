@@ -9,7 +9,7 @@ the locks of the other are dropped. So Python's is used only while pycolmap has 
 """
 
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -98,9 +98,7 @@ def keep_geometries(job: Job, pairs: Iterable[tuple[int, int]]) -> None:
     ids = job.image_ids
     wanted = {pycolmap.image_pair_to_pair_id(ids[i], ids[j]) for i, j in pairs}
     with _edited(job) as database:
-        there = [pair_id for (pair_id,) in database.execute("SELECT pair_id FROM two_view_geometries")]
-        others = [(pair_id,) for pair_id in there if pair_id not in wanted]
-        database.executemany("DELETE FROM two_view_geometries WHERE pair_id = ?", others)
+        _delete(database, "two_view_geometries", "pair_id", lambda pair_id: pair_id not in wanted)
 
 
 def clear_matches(job: Job, *tables: str) -> None:
@@ -170,13 +168,21 @@ def _verified_with(camera: pycolmap.Camera) -> tuple[Any, ...]:
 
 
 def _forget(job: Job, image_ids: Iterable[int], *tables: str) -> None:
-    most_ids = 2**31 - 1  # a pair's id is this times the smaller image id, plus the larger one
-    of_pairs = f"pair_id / {most_ids} = :photo OR pair_id % {most_ids} = :photo"
+    photos = set(image_ids)
+    if not photos:
+        return
     with _edited(job) as database:
-        for image_id in image_ids:
-            for table in tables:
-                condition = "image_id = :photo" if table in ("keypoints", "descriptors") else of_pairs
-                database.execute(f"DELETE FROM {table} WHERE {condition}", {"photo": image_id})
+        for table in tables:
+            if table in ("keypoints", "descriptors"):
+                _delete(database, table, "image_id", photos.__contains__)
+            else:
+                _delete(database, table, "pair_id", lambda i: not photos.isdisjoint(pycolmap.pair_id_to_image_pair(i)))
+
+
+def _delete(database: sqlite3.Connection, table: str, column: str, condition: Callable[[int], bool]) -> None:
+    """Delete the rows of a table whose key, an integer, meets a condition."""
+    keys = [row for row in database.execute(f"SELECT {column} FROM {table}") if condition(row[0])]
+    database.executemany(f"DELETE FROM {table} WHERE {column} = ?", keys)
 
 
 @contextmanager
