@@ -1,5 +1,8 @@
 """Which photos of a folder can be used, which share a camera, and what is said about the rest."""
 
+import os
+import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,6 +54,14 @@ def test_photos_are_sorted_and_upright(folder: Path):
     assert photos.names == ("a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg")
     assert [(photo.width, photo.height) for photo in photos.photos[:2]] == [(64, 48), (48, 64)]
     assert photos.unreadable == {}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such names")
+@pytest.mark.parametrize("read", [find_photos, find_subject])
+def test_a_name_that_is_not_text_is_refused_before_the_work(folder: Path, read: Callable[[Path], object]):
+    (folder / "c.jpg").rename(folder / os.fsdecode(b"caf\xe9.jpg"))
+    with pytest.raises(UserError, match=r"the name 'photos/caf\\udce9.jpg' is not in UTF-8"):
+        read(folder)
 
 
 def test_progress_counts_every_file(folder: Path):

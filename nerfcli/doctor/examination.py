@@ -20,6 +20,7 @@ from nerfcli.errors import UserError, in_shell
 from nerfcli.pages.findings import Finding, as_json, worst
 from nerfcli.photos.focal_evidence import focal_evidence, usual_focal_px
 from nerfcli.photos.images import list_photos, name_in, where_photos_may_be
+from nerfcli.poses.input.photos import refuse_odd_names
 from nerfcli.poses.judge.checks import Checks
 
 
@@ -74,8 +75,8 @@ def find_subject(path: Path, *, subfolders: bool = False) -> ExaminedCapture:
     A folder with photos and the files of a scene counts as a scene.
 
     Raises:
-        UserError: the path does not exist, is a video, has no photos, or is a scene with malformed files, or one with
-            `subfolders`.
+        UserError: the path does not exist, is a video, has no photos or odd names of photos, or is a scene with
+            malformed files, or one with `subfolders`.
     """
     if not path.exists():
         raise UserError(f"{path} does not exist", "give a folder of photos, or a scene folder")
@@ -95,6 +96,7 @@ def find_subject(path: Path, *, subfolders: bool = False) -> ExaminedCapture:
     photos = [*listed.pictures, *listed.unreadable]
     if not photos:
         raise UserError(f"no photos and no scene in {path}", where_photos_may_be(path))
+    refuse_odd_names(path, photos)
     sources = tuple(Source(name_in(path, photo), photo) for photo in photos)
     return ExaminedCapture(path, sources, None, listed.skipped)
 

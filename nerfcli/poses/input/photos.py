@@ -1,5 +1,6 @@
 """The photos that poses are estimated from: readability, upright size, groups with a common camera."""
 
+import re
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -61,7 +62,8 @@ def find_photos(
     `progress` receives (photos read, photos in all) after each photo.
 
     Raises:
-        UserError: no such folder, a file instead of a folder, no photos in it, or fewer than `MIN_PHOTOS` readable.
+        UserError: no such folder, a file instead of a folder, no photos in it, fewer than `MIN_PHOTOS` readable, or
+            `refuse_odd_names`.
     """
     if not folder.exists():
         raise UserError(f"the folder {folder} does not exist", "give a folder of photos, or a video file")
@@ -71,6 +73,7 @@ def find_photos(
     paths = [*listed.pictures, *listed.unreadable]
     if not paths:
         raise UserError(f"no photos in {folder}", where_photos_may_be(folder))
+    refuse_odd_names(folder, paths)
     photos: list[Photo] = []
     unreadable: dict[str, str] = {}
     with ThreadPoolExecutor(4) as readers:  # each holds a decoded photo in memory
@@ -86,6 +89,17 @@ def find_photos(
     exifs = with_digital_zoom([photo.exif for photo in photos])
     zoomed = tuple(replace(photo, exif=exif) for photo, exif in zip(photos, exifs, strict=True))
     return Photos(folder, zoomed, unreadable, listed.skipped)
+
+
+def refuse_odd_names(folder: Path, paths: Iterable[Path]) -> None:
+    """Refuse photos of a folder whose name, or its own, is not text: no report, scene or page could hold it.
+
+    Raises:
+        UserError: a name has bytes that are not UTF-8, for which Python has the stand-ins that are searched for here.
+    """
+    for name in (f"{folder.absolute().name}/{name_in(folder, path)}" for path in paths):
+        if re.search("[\udc80-\udcff]", name):
+            raise UserError(f"the name {name!r} is not in UTF-8", "rename it; old archives have such names")
 
 
 def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
