@@ -502,10 +502,12 @@ def test_exif_that_is_absent_or_odd_reads_as_none(tmp_path):
         ExifTags.Base.FocalLengthIn35mmFilm: 0,
     }
     nothing_over_nothing, too_far = (IFDRational(0, 0),) * 3, (IFDRational(200),) * 3
-    gps = {ExifTags.GPS.GPSLatitude: nothing_over_nothing, ExifTags.GPS.GPSLongitude: too_far}
-    exif = exif_with({ExifTags.Base.Make: "   "}, {ExifTags.IFD.Exif: camera, ExifTags.IFD.GPSInfo: gps})
-    Image.fromarray(noise(6, 8, 3)).save(path, exif=exif)
-    assert read_exif(path) == nothing
+    without_fix = (IFDRational(0),) * 3
+    for place in ((nothing_over_nothing, too_far), (without_fix, without_fix)):
+        gps = dict(zip((ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLongitude), place, strict=True))
+        exif = exif_with({ExifTags.Base.Make: "   "}, {ExifTags.IFD.Exif: camera, ExifTags.IFD.GPSInfo: gps})
+        Image.fromarray(noise(6, 8, 3)).save(path, exif=exif)
+        assert read_exif(path) == nothing
     Image.fromarray(noise(6, 8, 3)).save(path, exif=b"Exif\0\0II*\0\xff\xff\xff\xff")
     assert read_exif(path) == nothing
     np.testing.assert_array_equal(read_image(path).shape, (6, 8, 3))

@@ -192,13 +192,11 @@ _ENOUGH_TO_TELL = 6
 def gps_positions(frames: Sequence[Frame]) -> dict[str, Position]:
     """Read the GPS positions of photos from EXIF, by frame name; photos without a position are omitted.
 
-    Latitude 0, longitude 0 is omitted too: some cameras write it before they have a fix.
-
     Raises:
         UserError: a photo cannot be read.
     """
     found = {frame.name: read_exif(frame.image).gps for frame in frames if frame.image is not None}
-    return {name: gps for name, gps in found.items() if gps is not None and gps[:2] != (0.0, 0.0)}
+    return {name: gps for name, gps in found.items() if gps is not None}
 
 
 def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -> ScaleEstimate:

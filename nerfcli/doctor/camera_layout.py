@@ -168,7 +168,7 @@ def check_scene_files(scene: Capture) -> list[Finding]:
 
 def gps(photos: Sequence[PhotoFacts]) -> Finding | None:
     """Report the extent of the GPS positions of the photos; None if there are none."""
-    positions = [photo.exif.gps for photo in photos if photo.exif.gps is not None and photo.exif.gps[:2] != (0.0, 0.0)]
+    positions = [photo.exif.gps for photo in photos if photo.exif.gps is not None]
     if not positions:
         return None
     metres = east_north_up(positions)

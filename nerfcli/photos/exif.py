@@ -138,7 +138,7 @@ def _clock(value: Any, fraction: Any) -> float | None:
 def _position(gps: dict[int, Any]) -> tuple[float, float, float | None] | None:
     latitude = _degrees(gps.get(ExifTags.GPS.GPSLatitude), gps.get(ExifTags.GPS.GPSLatitudeRef), limit=90)
     longitude = _degrees(gps.get(ExifTags.GPS.GPSLongitude), gps.get(ExifTags.GPS.GPSLongitudeRef), limit=180)
-    if latitude is None or longitude is None:
+    if latitude is None or longitude is None or latitude == longitude == 0:  # written by some before they have a fix
         return None
     altitude = _number(gps.get(ExifTags.GPS.GPSAltitude))
     if altitude is not None and gps.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01"):
