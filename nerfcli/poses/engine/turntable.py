@@ -26,7 +26,7 @@ from nerfcli.photos.images import image_size, read_image
 from nerfcli.photos.masks import read_mask
 from nerfcli.poses.engine.features import feature_keys
 from nerfcli.poses.input import still_background as still
-from nerfcli.poses.input.job import Job, Tell, WorkMask, read_stage, stage_key, write_stage
+from nerfcli.poses.input.job import Job, Tell, WorkMask, file_key, read_stage, stage_key, write_stage
 from nerfcli.poses.input.layout import write_mask, write_no_mask
 
 # Features are searched in photos reduced to this longer side, and so many are kept.
@@ -43,6 +43,8 @@ _WHITE = (0.003, 0.9)
 # Change this whenever this module would find other masks or facts.
 _VERSION = "two motions, displaced backgrounds"
 _STAGE = "turntable.json"
+# Hashes of each photo and of its mask as written, by the photo's name, so that masks that were edited since are kept.
+_WRITTEN = "turntable-masks.json"
 MASKS = "masks"
 
 
@@ -159,7 +161,7 @@ def mask_turning_object(job: Job, tell: Tell) -> tuple[Job, dict[str, Any] | Non
     facts["masked"] = facts.get("why_not") is None and motions.found
     facts["unmasked"] = [name for name, mask in zip(job.names, masks, strict=True) if mask is None]
     if facts["masked"]:
-        job = replace(job, masks=_write_masks(job, masks))
+        job = replace(job, masks=_write_masks(job, masks, tell))
     facts["seconds"] = round(time.perf_counter() - start, 3)
     write_stage(Path(job.folder) / _STAGE, _key(job), facts)
     return job, facts
@@ -307,20 +309,41 @@ def _judge_masks(masks: Sequence[np.ndarray | None], pairs: Sequence[ComparedPai
     return facts
 
 
-def _write_masks(job: Job, masks: Sequence[np.ndarray | None]) -> tuple[WorkMask, ...]:
-    """Write a mask of each photo for pycolmap, and the object masks that were found for the user."""
+def _write_masks(job: Job, masks: Sequence[np.ndarray | None], tell: Tell) -> tuple[WorkMask, ...]:
+    """Write a mask of each photo for pycolmap, and those that were found for the user, except edited ones."""
     job.mask_folder.mkdir(exist_ok=True)
     scene_masks(job).mkdir(exist_ok=True)
+    stage = Path(job.folder) / _WRITTEN
+    written = read_stage(stage, _VERSION) or {}
     laid_out = []
-    for name, file, mask in zip(job.names, job.files, masks, strict=True):
+    for name, file, key, mask in zip(job.names, job.files, job.keys, masks, strict=True):
         size, target = image_size(job.photos / file), job.mask_folder / f"{file}.png"
         if mask is None:
             laid_out.append(write_no_mask(target, size))
             continue
-        used = still.enlarged(mask, size)
+        path = scene_masks(job) / f"{name}.png"
+        used = _edited(path, Path(job.originals) / name, key, written.get(name), tell)
+        if used is None:
+            used = still.enlarged(mask, size)
+            Image.fromarray(used).save(path)
+            written[name] = [key, file_key(path)]
         laid_out.append(write_mask(target, used))
-        Image.fromarray(used).save(scene_masks(job) / f"{name}.png")
+    write_stage(stage, _VERSION, written)
     return tuple(laid_out)
+
+
+def _edited(path: Path, photo: Path, key: str, written: Sequence[str] | None, tell: Tell) -> np.ndarray | None:
+    """Return a mask that the user has changed since it was written for this photo; None if it was not, or does not fit.
+
+    `written` has the hashes of the photo and of the mask at that time.
+    """
+    if written is None or not path.is_file() or key != written[0] or file_key(path) == written[1]:
+        return None
+    try:
+        return read_mask(path, photo) > 0
+    except UserError as error:
+        tell(f"{error.message}: making it anew")
+        return None
 
 
 def _key(job: Job) -> str:
