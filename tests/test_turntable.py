@@ -258,7 +258,7 @@ def solved(photos: Path, scene_dir: Path, **options: Any) -> tuple[dict, list[st
 def errors(capture: Turntable, scene_dir: Path) -> tuple[float, float]:
     """Return the largest position error (fraction of the radius) and rotation error (degrees) after alignment."""
     frames = load_scene(scene_dir).frames
-    truth = np.array([capture.object_from_cam[int(frame.name[5:8])] for frame in frames])
+    truth = np.array([capture.object_from_cam[int(Path(frame.name).name[5:8])] for frame in frames])
     found = np.array([frame.world_from_cam for frame in frames])
     moved = align(found[:, :3, 3], truth[:, :3, 3])
     aligned = np.array([moved.apply_pose(pose) for pose in found])
@@ -320,10 +320,16 @@ class TestPoses:
             assert report["images"][0]["registered"]
 
     def test_camera_at_two_heights_that_is_turned_a_little_between_photos(self, tmp_path: Path) -> None:
-        """The background of either height moves by 10 px (standard deviation) from photo to photo, 1.7 % of 600 px."""
+        """The background of either height moves by 10 px (standard deviation) from photo to photo, 1.7 % of 600 px.
+
+        The photos are in a subfolder, and so are their masks.
+        """
         capture = turntable(16, size=(480, 360), heights=2, turn_deg=90, shift_px=10, supersampled=1, seed=2)
         write(capture, tmp_path)
-        report, notes = solved(tmp_path / "images", tmp_path / "scene")
+        (tmp_path / "images").rename(tmp_path / "one camera")
+        (tmp_path / "photos").mkdir()
+        (tmp_path / "one camera").rename(tmp_path / "photos" / "one camera")
+        report, notes = solved(tmp_path / "photos", tmp_path / "scene", subfolders=True)
         assert report["moving_foreground"]["masked"]
         assert report["moving_foreground"]["unmasked"] == []
         assert report["registered"] == len(capture.photos)

@@ -312,7 +312,6 @@ def _judge_masks(masks: Sequence[np.ndarray | None], pairs: Sequence[ComparedPai
 def _write_masks(job: Job, masks: Sequence[np.ndarray | None], tell: Tell) -> tuple[WorkMask, ...]:
     """Write a mask of each photo for pycolmap, and those that were found for the user, except edited ones."""
     job.mask_folder.mkdir(exist_ok=True)
-    scene_masks(job).mkdir(exist_ok=True)
     stage = Path(job.folder) / _WRITTEN
     written = read_stage(stage, _VERSION) or {}
     laid_out = []
@@ -325,6 +324,7 @@ def _write_masks(job: Job, masks: Sequence[np.ndarray | None], tell: Tell) -> tu
         used = _edited(path, Path(job.originals) / name, key, written.get(name), tell)
         if used is None:
             used = still.enlarged(mask, size)
+            path.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(used).save(path)
             written[name] = [key, file_key(path)]
         laid_out.append(write_mask(target, used))
