@@ -1,6 +1,7 @@
 """Structure from motion, end to end, on the room corner of `corner`, whose poses are known."""
 
 import json
+import signal
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -211,7 +212,7 @@ def test_the_last_output_of_a_dying_worker_is_reported(tmp_path: Path, monkeypat
         supervise.run_worker(tmp_path / "job.json", threads=1, progress=lambda *reported: None)
 
 
-def test_deaths_are_explained():
+def test_deaths_are_explained(monkeypatch: pytest.MonkeyPatch):
     log = "*** Aborted at 1 ***\nF1120 bundle.cc:9] Check failed: x > 0\n    @ 0x7f (libc.so)\n"
     aborted = supervise.explain_death(-6, "matching photos (3 of 10 done)", log, 10**9)
     assert aborted.message == (
@@ -219,6 +220,8 @@ def test_deaths_are_explained():
         "F1120 bundle.cc:9] Check failed: x > 0"
     )
     assert supervise.explain_death(-9, "finding features", "", 10**9).exit_code == OUT_OF_MEMORY
+    monkeypatch.delattr(signal, "SIGKILL")  # as on Windows
+    assert "crashed (exit status 3)" in supervise.explain_death(3, "finding features", "", 10**9).message
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def run_worker(
 
     Args:
         job_path: the job's JSON file; the worker's log is written beside it.
-        threads: for OpenMP inside pycolmap, -1 for all.
+        threads: for OpenMP inside pycolmap.
         memory_bytes: the worker is stopped when its resident memory exceeds this; None for no limit.
         lock: a descriptor that the worker inherits.
 
@@ -103,7 +103,7 @@ def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> Use
             f"structure from motion stopped while {stage}: the disk is full ({free_bytes / 1000000.0:.1f} MB free)",
             f"free some disk space, or choose another disk with -o; {_GO_ON}",
         )
-    if returncode == -signal.SIGKILL:
+    if returncode == -9:  # SIGKILL, which Python's signals on Windows lack
         return WorkerDiedError(
             f"structure from motion was killed while {stage}, most likely because memory ran out",
             f"{_LESS_MEMORY}; {_GO_ON}",
