@@ -32,7 +32,14 @@ def lettered(count: int) -> list[Photo]:
     return named(*(f"{chr(97 + k % 26)}{chr(97 + k // 26)}.jpg" for k in range(count)))
 
 
-@pytest.mark.parametrize("names", [["IMG_9.jpg", "IMG_10.jpg", "IMG_8.jpg"], ["0009.png", "0010.png", "0008.png"]])
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["IMG_9.jpg", "IMG_10.jpg", "IMG_8.jpg"],
+        ["0009.png", "0010.png", "0008.png"],
+        ["a.b9.jp2", "a.b10.jp2", "a.b8.jp2"],
+    ],
+)
 def test_names_are_ordered_by_their_number(names: list[str]):
     assert capture_order(names) == [2, 0, 1]
 

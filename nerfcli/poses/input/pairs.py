@@ -138,7 +138,7 @@ def capture_order(names: Sequence[str]) -> list[int] | None:
 
     Cameras and video tools write such names: IMG_0412.JPG, frame_9.png, frame_10.png.
     """
-    parts = [re.fullmatch(r"(.*?)(\d+)(\D*)", name) for name in names]
+    parts = [re.fullmatch(r"(.*?)(\d+)(\D*(?:\.[^.]*)?)", name) for name in names]  # .jp2 is no number
     matches = [match for match in parts if match]
     if len(matches) < len(names) or len({(match[1], match[3].lower()) for match in matches}) > 1:
         return None
