@@ -261,7 +261,6 @@ def test_a_scene_of_stabilised_photos_has_their_principal_points(stabilised):
     assert any("its own principal point" in note for note in closing_notes(report))
     model = pycolmap.Reconstruction(str(scene_dir / "sparse" / "0"))
     assert report.strict is not None
-    assert report.strict["fingerprint_before"] == report.strict["fingerprint_after"]
     large = [0, 1, 2, 3, 4]  # the others are smaller, of another lens
     cameras = [model.camera(model.find_image_with_name(NAMES[number]).camera_id) for number in large]
     assert len({camera.camera_id for camera in cameras}) == len(large)

@@ -16,7 +16,7 @@ import pycolmap
 from nerfcli.poses.engine.database import evidence
 from nerfcli.poses.engine.features import extract, match, start_matching
 from nerfcli.poses.engine.retrieval import select_pairs
-from nerfcli.poses.input.job import Job, Report, stage_key
+from nerfcli.poses.input.job import Job, Report
 from nerfcli.poses.model.held_out import MAPPER
 from nerfcli.poses.model.locate import place
 from nerfcli.poses.model.principal_points import LEAST_OBSERVATIONS, camera_of_lens, refine_with_principal_point
@@ -54,7 +54,7 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
     """Place the held-out photos of a job in the model of its training photos, and add them to the model on disk.
 
     Returns the worker's result for `training`, the `training_part` of the job, as one for all photos, with "strict":
-    how each held-out photo was placed, and the fingerprints of the training model before and after, which are equal.
+    how each held-out photo was placed.
     """
     folder = Path(job.folder) / "sparse" / "0"
     whole = _renumbered(job, training, result)
@@ -67,7 +67,6 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
     start_matching(job, [(i, j) for i, j in job.pairs if not {i, j} <= held_out])
     unmatched = match(job, across, report)
     model = pycolmap.Reconstruction(folder)
-    before = fingerprint(model)
     placed: dict[int, dict[str, Any]] = {}
     reasons: dict[str, str] = {}
     own = (result.get("principal_points") or {"kept": False})["kept"]
@@ -78,10 +77,6 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
         else:
             placed[number] = found
         report("map", done + 1, len(job.held_out))
-    # Held-out photos only add poses, so they are excluded from the fingerprint.
-    after = fingerprint(model, without=frozenset(job.names[number] for number in placed))
-    if after != before:
-        raise AssertionError("locating held-out photos changed the model of the training photos")
     model.write_binary(folder)
     whole["models"][0] = sorted([*whole["models"][0], *placed])
     whole["left_out"] |= reasons
@@ -92,34 +87,8 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
     whole["strict"] = {
         "held_out": [job.names[number] for number in job.held_out],
         "placed": {job.names[number]: found for number, found in placed.items()},
-        "fingerprint_before": before,
-        "fingerprint_after": after,
     }
     return whole
-
-
-def fingerprint(model: pycolmap.Reconstruction, *, without: frozenset[str] = frozenset()) -> str:
-    """Return a hash of every bit of the points with tracks, and of the cameras and poses of images not in `without`."""
-    others = {image.camera_id for image in model.images.values() if image.name not in without}
-    cameras = [
-        (number, camera.model.name, _bits(camera.params))
-        for number, camera in sorted(model.cameras.items())
-        if number in others
-    ]
-    points = [
-        (number, _bits(point.xyz), sorted((e.image_id, e.point2D_idx) for e in point.track.elements))
-        for number, point in sorted(model.points3D.items())
-    ]
-    images = [
-        (image.name, image.camera_id, _bits(image.cam_from_world().matrix()))
-        for _, image in sorted(model.images.items())
-        if image.has_pose and image.name not in without
-    ]
-    return stage_key(cameras, points, images)
-
-
-def _bits(values: Any) -> str:
-    return np.ascontiguousarray(values, dtype=np.float64).tobytes().hex()
 
 
 def _place(
