@@ -83,8 +83,7 @@ def examined(model: pycolmap.Reconstruction, job: Job, checks: Checks | None = N
     """Return what the report says about a model, after a round trip through JSON."""
     found = examine.examine([model], job, lambda *progress: None, checks=checks)
     content = {"verdict": found.verdict.to_json(), "blur": found.blur_px, "left_out": found.left_out, **found.details}
-    content, _ = replace_non_finite(content)
-    return json.loads(json.dumps(content, allow_nan=False))
+    return json.loads(json.dumps(replace_non_finite(content), allow_nan=False))
 
 
 @given(
@@ -174,13 +173,6 @@ def test_a_result_that_is_not_finite_is_written_as_null(job: Job, monkeypatch: p
     )
     content = json.loads((Path(job.folder) / "result.json").read_text(encoding="utf-8"))["content"]
     assert set(content["pose_blur_px"].values()) == {None}
-    assert content["not_finite"]["pose_blur_px.0"] == "inf"
-
-
-def test_finite_leaves_finite_content_as_it_is():
-    content = {"a": [1, 2.5, None, "x", True], "b": {"c": (1.0, -0.0)}}
-    assert replace_non_finite(content) == ({"a": [1, 2.5, None, "x", True], "b": {"c": [1.0, -0.0]}}, {})
-    assert replace_non_finite([math.nan, {"x": -math.inf}]) == ([None, {"x": None}], {"0": "nan", "1.x": "-inf"})
 
 
 def test_components_say_what_joins_them(job: Job):

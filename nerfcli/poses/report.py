@@ -44,8 +44,7 @@ class PosesReport:
     kept model. intrinsics: the given intrinsics, see `cameras.PhotoGroups`. strict: how held-out photos were placed
     afterwards, see `strict.place_held_out`. components: each model's photos and why it is not joined to the largest,
     ordered by size.
-    not_computed: checks that could not be computed, and why. not_finite: where the report has null for a number that
-    was not finite.
+    not_computed: checks that could not be computed, and why.
     cut_short: what was stopped because it took far longer than planned.
     moving_foreground: facts about an object that turns in front of a static background, and its masks; see `turntable`.
     """
@@ -70,7 +69,6 @@ class PosesReport:
     strict: dict[str, Any] | None = None
     components: tuple[dict[str, Any], ...] = ()
     not_computed: dict[str, str] = field(default_factory=dict)
-    not_finite: dict[str, str] = field(default_factory=dict)
     moving_foreground: dict[str, Any] | None = None
     principal_points: dict[str, Any] | None = None
     cut_short: tuple[str, ...] = ()

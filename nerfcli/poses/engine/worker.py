@@ -165,32 +165,13 @@ def _apart(photos: set[int], largest: set[int], pairs: Sequence[tuple[int, int, 
     return f"{pairs_connect} it to the largest (strongest: {best}), but no consistent alignment was found"
 
 
-def replace_non_finite(content: Any) -> tuple[Any, dict[str, str]]:
-    """Copy plain content, with None in place of every non-finite number.
-
-    Args:
-        content: dictionaries, lists, tuples and plain values. Tuples come back as lists.
-
-    Returns:
-        The copy, and the replaced numbers by their path: `{"lenses.0.gain": "inf"}`.
-
-    Example:
-        >>> replace_non_finite({"gain": [1.0, float("inf")]})
-        ({'gain': [1.0, None]}, {'gain.1': 'inf'})
-    """
-    replaced: dict[str, str] = {}
-
-    def copy(value: Any, place: str) -> Any:
-        if isinstance(value, dict):
-            return {key: copy(item, f"{place}.{key}" if place else str(key)) for key, item in value.items()}
-        if isinstance(value, (list, tuple)):
-            return [copy(item, f"{place}.{index}" if place else str(index)) for index, item in enumerate(value)]
-        if isinstance(value, float) and not math.isfinite(value):
-            replaced[place] = str(float(value))
-            return None
-        return value
-
-    return copy(content, ""), replaced
+def replace_non_finite(content: Any) -> Any:
+    """Copy plain content, with None in place of every number that is not finite, which JSON cannot hold."""
+    if isinstance(content, dict):
+        return {key: replace_non_finite(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [replace_non_finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 # The last stage's file, with the data for the report. The model is beside it, in sparse/0.
@@ -235,8 +216,7 @@ def solve(job: Job, report: Report, tell: Tell) -> None:
     for stage, value in seconds.items():
         result["seconds"][stage] = round(result["seconds"].get(stage, 0.0) + value, 3)
     result["moving_foreground"] = moving
-    result, replaced = replace_non_finite(result)
-    write_stage(path, result_key(job), result | {"not_finite": replaced})
+    write_stage(path, result_key(job), replace_non_finite(result))
     name_images(job)
 
 
