@@ -267,122 +267,104 @@ def test_looking_for_similar_photos_stays_affordable(photos: int, seconds: float
     assert plan.seconds["pair"] == pytest.approx(seconds, abs=0.1)
 
 
+class Outlook:
+    """A time estimate whose clock is set by each report; by default of ten photos."""
+
+    def __init__(self, seconds: dict[str, float], *, photos: int = 10, features: int = 4096):
+        self._now = 0.0
+        plan = Plan(photos, 1600, 4096, "exhaustive", 45, seconds, features=features)
+        self._estimate = TimeEstimate(plan, clock=lambda: self._now)
+
+    def at(self, now: float, stage: str, done: int, total: int) -> tuple[float, float]:
+        """Return the fraction done and the seconds left when a stage reports at this time."""
+        self._now = now
+        return self._estimate.update(stage, done, total)
+
+    def left(self, now: float, stage: str, done: int, total: int) -> float:
+        return self.at(now, stage, done, total)[1]
+
+    def whole(self, start: float, end: float, stage: str, total: int) -> tuple[float, float]:
+        """Return the same at the end of a stage that reports its beginning and its end."""
+        self.at(start, stage, 0, total)
+        return self.at(end, stage, total, total)
+
+
 def test_the_outlook_measures_and_stretches_what_is_to_come():
     """If the first stage takes twice its planned time, so will the rest, until a later stage proves faster."""
-    seconds = {"extract": 10.0, "match": 30.0, "map": 10.0}
-    now = 0.0
-    outlook = TimeEstimate(Plan(10, 1600, 4096, "exhaustive", 45, seconds), clock=lambda: now)
-    assert outlook.update("extract", 0, 10) == (0.0, 50.0)
-    now = 10.0
-    assert outlook.update("extract", 5, 10) == (pytest.approx(0.1), pytest.approx(90.0))
-    now = 20.0
-    assert outlook.update("extract", 10, 10)[1] == pytest.approx(80.0)
+    outlook = Outlook({"extract": 10.0, "match": 30.0, "map": 10.0})
+    assert outlook.at(0, "extract", 0, 10) == (0.0, 50.0)
+    assert outlook.at(10, "extract", 5, 10) == (pytest.approx(0.1), pytest.approx(90.0))
+    assert outlook.left(20, "extract", 10, 10) == pytest.approx(80.0)
     # Half of the pairs were already done: the rate is measured on the other half alone.
-    outlook.update("match", 20, 40)
-    now = 25.0
+    outlook.at(20, "match", 20, 40)
     # A quarter planned for 7.5 s takes 5 s. The machine may be faster than planned: a fifth is taken off mapping.
-    assert outlook.update("match", 30, 40)[1] == pytest.approx(5.0 + 10.0 * 0.8)
-    now = 30.0
-    outlook.update("map", 10, 10)
-    assert outlook.update("map", 10, 10) == (1.0, 0.0)
-    assert outlook.update("check", 1, 4) == (1.0, 0.0)
+    assert outlook.left(25, "match", 30, 40) == pytest.approx(5.0 + 10.0 * 0.8)
+    outlook.at(30, "map", 10, 10)
+    assert outlook.at(30, "map", 10, 10) == (1.0, 0.0)
+    assert outlook.at(30, "check", 1, 4) == (1.0, 0.0)
 
 
 def test_a_stage_that_takes_long_does_not_stretch_the_others():
     """A stage planned for 1 s takes 20 s; the other 100 s are not predicted to become 2000 s."""
-    now = 0.0
-    seconds = {"extract": 50.0, "pair": 1.0, "match": 100.0}
-    outlook = TimeEstimate(Plan(10, 1600, 4096, "sequential", 45, seconds), clock=lambda: now)
-    outlook.update("extract", 0, 10)
-    now = 50.0
-    outlook.update("extract", 10, 10)
-    outlook.update("pair", 0, 10)
-    now = 70.0
-    outlook.update("pair", 10, 10)
-    assert outlook.update("match", 0, 45)[1] == pytest.approx(100.0)
+    outlook = Outlook({"extract": 50.0, "pair": 1.0, "match": 100.0})
+    outlook.whole(0, 50, "extract", 10)
+    outlook.whole(50, 70, "pair", 10)
+    assert outlook.left(70, "match", 0, 45) == pytest.approx(100.0)
 
 
 @pytest.mark.parametrize("seconds_per_photo", [0.2, 1.0, 5.0])
 def test_the_mapper_takes_longer_for_later_photos(seconds_per_photo: float):
     """Closed form: seconds grow as the number of photos to the power of 1.3, and the remaining time is exact."""
-    now = 0.0
-    outlook = TimeEstimate(Plan(300, 1600, 4096, "sequential", 9000, {"map": 100.0}), clock=lambda: now)
+    outlook = Outlook({"map": 100.0}, photos=300)
     whole = seconds_per_photo * 300**1.3
-    outlook.update("map", 0, 300)
+    outlook.at(0, "map", 0, 300)
     for done in range(30, 300, 30):
         now = seconds_per_photo * done**1.3
-        assert outlook.update("map", done, 300)[1] == pytest.approx(whole - now)
+        assert outlook.left(now, "map", done, 300) == pytest.approx(whole - now)
 
 
 def test_a_second_search_for_features_adds_to_what_is_left_and_takes_nothing_from_the_share():
     """Half of the photos are searched again, at three times the cost: 10 s of searching become 25 s."""
-    now = 0.0
-    outlook = TimeEstimate(
-        Plan(10, 1600, 4096, "exhaustive", 45, {"extract": 10.0, "match": 8.0, "map": 2.0}), clock=lambda: now
-    )
-    outlook.update("extract", 0, 10)
-    now = 10.0
-    assert outlook.update("extract", 10, 10) == (pytest.approx(0.5), pytest.approx(10.0))
-    assert outlook.update("enlarge", 0, 5) == (pytest.approx(0.5), pytest.approx(15.0 + 10.0))
-    now = 22.0
-    fraction, left = outlook.update("enlarge", 4, 5)
-    assert (fraction, left) == (pytest.approx(22.0 / 35.0), pytest.approx(3.0 + 10.0))
+    outlook = Outlook({"extract": 10.0, "match": 8.0, "map": 2.0})
+    assert outlook.whole(0, 10, "extract", 10) == (pytest.approx(0.5), pytest.approx(10.0))
+    assert outlook.at(10, "enlarge", 0, 5) == (pytest.approx(0.5), pytest.approx(15.0 + 10.0))
+    assert outlook.at(22, "enlarge", 4, 5) == (pytest.approx(22.0 / 35.0), pytest.approx(3.0 + 10.0))
     # Two photos are searched once more, each as long as the first time.
-    now = 25.0
-    outlook.update("enlarge", 5, 5)
-    assert outlook.update("faint", 0, 2)[1] == pytest.approx(2.0 + 10.0)
+    outlook.at(25, "enlarge", 5, 5)
+    assert outlook.left(25, "faint", 0, 2) == pytest.approx(2.0 + 10.0)
     # Later stages scale with the speed of the machine, not with the number of photos that were searched twice.
-    now = 27.0
-    outlook.update("faint", 2, 2)
-    assert outlook.update("match", 0, 45)[1] == pytest.approx(10.0)
+    outlook.at(27, "faint", 2, 2)
+    assert outlook.left(27, "match", 0, 45) == pytest.approx(10.0)
 
 
 def test_merging_and_locating_add_to_what_is_left_and_take_nothing_from_the_share():
     """Merging takes a fifth of the planned mapping time on a machine as fast as planned, and precedes the checks."""
-    now = 0.0
-    outlook = TimeEstimate(Plan(10, 1600, 4096, "exhaustive", 45, {"map": 100.0, "check": 20.0}), clock=lambda: now)
-    outlook.update("map", 0, 10)
-    now = 100.0
-    assert outlook.update("map", 10, 10) == (pytest.approx(100.0 / 120.0), pytest.approx(20.0))
-    assert outlook.update("merge", 0, 4) == (pytest.approx(100.0 / 120.0), pytest.approx(20.0 + 20.0))
+    outlook = Outlook({"map": 100.0, "check": 20.0})
+    assert outlook.whole(0, 100, "map", 10) == (pytest.approx(100.0 / 120.0), pytest.approx(20.0))
+    assert outlook.at(100, "merge", 0, 4) == (pytest.approx(100.0 / 120.0), pytest.approx(20.0 + 20.0))
     # The first of four has nothing to merge with and takes no time, which says little about the others.
-    assert outlook.update("merge", 1, 4)[1] == pytest.approx(0.75 * 15.0 + 0.8 * 20.0)
-    now = 105.0
-    assert outlook.update("merge", 1, 4)[1] == pytest.approx(15.0 + 20.0)
-    now = 120.0
-    outlook.update("merge", 4, 4)
+    assert outlook.left(100, "merge", 1, 4) == pytest.approx(0.75 * 15.0 + 0.8 * 20.0)
+    assert outlook.left(105, "merge", 1, 4) == pytest.approx(15.0 + 20.0)
+    outlook.at(120, "merge", 4, 4)
     # Then 20 trials to locate single photos, at 0.7 s each.
-    assert outlook.update("locate", 0, 20) == (pytest.approx(120.0 / 140.0), pytest.approx(14.0 + 20.0))
-    now = 134.0
-    outlook.update("locate", 20, 20)
+    assert outlook.at(120, "locate", 0, 20) == (pytest.approx(120.0 / 140.0), pytest.approx(14.0 + 20.0))
+    outlook.at(134, "locate", 20, 20)
     # Ten more trials after another attempt to merge.
-    assert outlook.update("locate", 0, 10)[1] == pytest.approx(7.0 + 20.0)
-    now = 141.0
-    outlook.update("locate", 10, 10)
-    assert outlook.update("check", 0, 4) == (pytest.approx(141.0 / 161.0), pytest.approx(20.0))
+    assert outlook.left(134, "locate", 0, 10) == pytest.approx(7.0 + 20.0)
+    outlook.at(141, "locate", 10, 10)
+    assert outlook.at(141, "check", 0, 4) == (pytest.approx(141.0 / 161.0), pytest.approx(20.0))
 
 
 def test_principal_points_of_the_photos_add_to_what_is_left_and_take_nothing_from_the_share():
     """A trial of them is planned; going on with them takes five times as long on a machine as fast as planned."""
-    now = 0.0
-    outlook = TimeEstimate(
-        Plan(10, 1600, 4096, "exhaustive", 45, {"map": 10.0, "check": 20.0, "stabilise": 4.0}), clock=lambda: now
-    )
-    outlook.update("map", 0, 10)
-    now = 10.0
-    outlook.update("map", 10, 10)
-    outlook.update("check", 0, 4)
-    now = 30.0
-    assert outlook.update("check", 4, 4) == (pytest.approx(30.0 / 34.0), pytest.approx(4.0))
-    outlook.update("stabilise", 0, 2)
-    now = 32.0
-    assert outlook.update("stabilise", 1, 2) == (pytest.approx(32.0 / 34.0), pytest.approx(2.0))
-    now = 34.0
-    assert outlook.update("settle", 0, 4) == (pytest.approx(32.0 / 34.0), pytest.approx(20.0))
-    now = 44.0
-    assert outlook.update("settle", 2, 4)[1] == pytest.approx(10.0)
-    now = 54.0
-    assert outlook.update("settle", 4, 4) == (1.0, 0.0)
+    outlook = Outlook({"map": 10.0, "check": 20.0, "stabilise": 4.0})
+    outlook.whole(0, 10, "map", 10)
+    assert outlook.whole(10, 30, "check", 4) == (pytest.approx(30.0 / 34.0), pytest.approx(4.0))
+    outlook.at(30, "stabilise", 0, 2)
+    assert outlook.at(32, "stabilise", 1, 2) == (pytest.approx(32.0 / 34.0), pytest.approx(2.0))
+    assert outlook.at(34, "settle", 0, 4) == (pytest.approx(32.0 / 34.0), pytest.approx(20.0))
+    assert outlook.left(44, "settle", 2, 4) == pytest.approx(10.0)
+    assert outlook.at(54, "settle", 4, 4) == (1.0, 0.0)
 
 
 @pytest.mark.parametrize("checked", [(0.0, 0.03, 0.46, 0.8, 1.0), (0.0, 0.02, 0.54, 0.82, 1.0)])
@@ -390,10 +372,8 @@ def test_principal_points_of_the_photos_add_to_what_is_left_and_take_nothing_fro
     ("planned", "taken"),
     [
         ((29, 55, 25, 12), (44, 117, 46, 20)),  # 50 photos by phone
-        (
-            (9, 53, 21, 10),
-            (10, 184, 20, 13),
-        ),  # 49 photos of a shiny object: a match takes three times as long as planned
+        # 49 photos of a shiny object: a match takes three times as long as planned
+        ((9, 53, 21, 10), (10, 184, 20, 13)),
         ((18, 11, 10, 8), (15, 17, 7, 8)),  # 23 photos
     ],
 )
@@ -404,30 +384,24 @@ def test_what_is_left_is_right_within_a_half_from_a_quarter_on(
     grows, and that the four checks advance as measured on the 50 photos and on 20 others.
     """
     stages = ("extract", "match", "map", "check")
-    now = 0.0
-    plan = Plan(50, 1600, 4096, "exhaustive", 1225, {s: float(p) for s, p in zip(stages, planned, strict=True)})
-    outlook = TimeEstimate(plan, clock=lambda: now)
+    outlook = Outlook({stage: float(seconds) for stage, seconds in zip(stages, planned, strict=True)}, photos=50)
     began, whole = 0.0, sum(taken)
     for stage, seconds in zip(stages, taken, strict=True):
         steps = 4 if stage == "check" else 50
         for done in range(steps + 1):
             even = (done / steps) ** (1.3 if stage == "map" else 1.0)
             now = began + seconds * (checked[done] if stage == "check" else even)
-            left = outlook.update(stage, done, steps)[1]
+            left = outlook.left(now, stage, done, steps)
             if whole / 4 <= now < 0.97 * whole:
                 assert 1 / 1.5 < left / (whole - now) < 1.5, (stage, done)
-        began = now
+        began += seconds
 
 
 def test_matching_is_planned_by_the_features_that_were_found():
     """Closed form: a quarter of the features that the plan counts on take a quarter of its time."""
-    now = 0.0
-    seconds = {"extract": 10.0, "match": 100.0, "map": 20.0}
-    outlook = TimeEstimate(Plan(10, 1600, 4096, "exhaustive", 45, seconds, features=4000), clock=lambda: now)
-    outlook.update("extract", 0, 10)
-    now = 10.0
-    assert outlook.update("extract", 10, 10)[1] == pytest.approx(120.0)
-    assert outlook.update("features", 1000, 4096) == (pytest.approx(10.0 / 55.0), pytest.approx(45.0))
+    outlook = Outlook({"extract": 10.0, "match": 100.0, "map": 20.0}, features=4000)
+    assert outlook.whole(0, 10, "extract", 10)[1] == pytest.approx(120.0)
+    assert outlook.at(10, "features", 1000, 4096) == (pytest.approx(10.0 / 55.0), pytest.approx(45.0))
 
 
 def test_mapping_is_planned_by_the_matches_that_were_found():
@@ -435,50 +409,34 @@ def test_mapping_is_planned_by_the_matches_that_were_found():
 
     Checks of them take twice 1 + 10 * (0.04 + 10 * 0.0002) s.
     """
-    now = 0.0
-    outlook = TimeEstimate(Plan(10, 1600, 4096, "exhaustive", 45, {"match": 10.0, "map": 20.0}), clock=lambda: now)
-    outlook.update("match", 0, 45)
-    now = 10.0
-    assert outlook.update("match", 45, 45)[1] == pytest.approx(20.0)
-    assert outlook.update("matches", 8000, 0)[1] == pytest.approx(1.9 + 2.84)
+    outlook = Outlook({"match": 10.0, "map": 20.0})
+    assert outlook.whole(0, 10, "match", 45)[1] == pytest.approx(20.0)
+    assert outlook.left(10, "matches", 8000, 0) == pytest.approx(1.9 + 2.84)
 
 
 def test_another_attempt_is_measured_from_its_own_start():
     """The mapper took 100 s to get stuck at 60 of 100 photos, and starts anew from two photos, as it did then."""
-    now = 0.0
-    outlook = TimeEstimate(Plan(100, 1600, 4096, "exhaustive", 45, {"map": 120.0}), clock=lambda: now)
-    outlook.update("map", 2, 100)
-    now = 100.0
-    outlook.update("map", 60, 100)
-    outlook.update("map", 2, 100)
-    now = 101.0
-    assert 60.0 < outlook.update("map", 3, 100)[1] < 300.0
+    outlook = Outlook({"map": 120.0}, photos=100)
+    outlook.at(0, "map", 2, 100)
+    outlook.at(100, "map", 60, 100)
+    outlook.at(100, "map", 2, 100)
+    assert 60.0 < outlook.left(101, "map", 3, 100) < 300.0
 
 
 def test_another_attempt_does_not_count_single_photos_of_the_first_again():
     """Closed form: the last of ten photos, of 10 s of mapping, and checks of 2 s are left, and no trials."""
-    now = 0.0
-    outlook = TimeEstimate(Plan(10, 1600, 4096, "exhaustive", 45, {"map": 10.0, "check": 2.0}), clock=lambda: now)
-    outlook.update("map", 0, 10)
-    now = 10.0
-    outlook.update("map", 10, 10)
-    outlook.update("locate", 0, 20)
-    now = 24.0
-    outlook.update("check", 0, 4)
-    now = 26.0
-    outlook.update("check", 4, 4)
-    assert outlook.update("map", 9, 10)[1] == pytest.approx(10.0 * (1 - 0.9**1.3) + 2.0)
+    outlook = Outlook({"map": 10.0, "check": 2.0})
+    outlook.whole(0, 10, "map", 10)
+    outlook.at(10, "locate", 0, 20)
+    outlook.whole(24, 26, "check", 4)
+    assert outlook.left(26, "map", 9, 10) == pytest.approx(10.0 * (1 - 0.9**1.3) + 2.0)
 
 
 def test_another_attempt_lowers_the_share():
     """Mapping begins again after the checks: the work is not at its end."""
-    now = 0.0
-    seconds = {"extract": 10.0, "map": 10.0, "check": 2.0}
-    outlook = TimeEstimate(Plan(10, 1600, 4096, "exhaustive", 45, seconds), clock=lambda: now)
-    now = 20.0
-    outlook.update("map", 10, 10)
-    now = 22.0
-    assert outlook.update("check", 4, 4)[0] == 1.0
-    fraction, left = outlook.update("map", 0, 10)
+    outlook = Outlook({"extract": 10.0, "map": 10.0, "check": 2.0})
+    outlook.at(20, "map", 10, 10)
+    assert outlook.at(22, "check", 4, 4)[0] == 1.0
+    fraction, left = outlook.at(22, "map", 0, 10)
     assert left > 5.0
     assert fraction == pytest.approx(22.0 / (22.0 + left))
