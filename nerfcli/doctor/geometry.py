@@ -149,7 +149,7 @@ def turning_object(pairs: Sequence[Pair]) -> Finding | None:
 
     In such a capture the camera stood still, so the other checks of movement between pairs do not apply.
     """
-    motions = together([(pair.first, pair.second, pair.motions) for pair in pairs if pair.motions is not None])
+    motions = together([pair.motions for pair in pairs if pair.motions is not None])
     others = sum(pair.linked and pair.motions is None for pair in pairs)
     motions = replace(motions, moved=motions.moved + others)
     if not motions.found:

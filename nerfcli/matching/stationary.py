@@ -100,7 +100,6 @@ class Stationary:
 
     Args:
         two, still, moved: number of pairs with two motions, with static matches alone, and with one motion.
-        photos: number of photos in pairs with two motions.
         cells: fraction of the picture's cells that have still matches in at least two pairs with two motions.
         extent: fraction of the picture that the box around these cells covers.
     """
@@ -108,7 +107,6 @@ class Stationary:
     two: int
     still: int
     moved: int
-    photos: int
     cells: float
     extent: float
 
@@ -197,10 +195,10 @@ def motions(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> Motions:
     return Motions(stays, moves, agreeing, _cells(x[stays], size))
 
 
-def together(pairs: Sequence[tuple[int, int, Motions]]) -> Stationary:
-    """Summarize pairs (photo, photo, motions)."""
-    two = [pair for pair in pairs if pair[2].two]
-    counts = Counter(cell for _, _, pair in two for cell in pair.cells)
+def together(pairs: Sequence[Motions]) -> Stationary:
+    """Summarize the motions of pairs of photos."""
+    two = [pair for pair in pairs if pair.two]
+    counts = Counter(cell for pair in two for cell in pair.cells)
     cells = [cell for cell, count in counts.items() if count >= 2]
     columns, rows = _CELLS
     extent = 0.0
@@ -209,9 +207,8 @@ def together(pairs: Sequence[tuple[int, int, Motions]]) -> Stationary:
         extent = float((np.ptp(down) + 1) * (np.ptp(across) + 1) / (columns * rows))
     return Stationary(
         two=len(two),
-        still=sum(pair.only_still for _, _, pair in pairs),
-        moved=sum(pair.one for _, _, pair in pairs),
-        photos=len({photo for pair in two for photo in pair[:2]}),
+        still=sum(pair.only_still for pair in pairs),
+        moved=sum(pair.one for pair in pairs),
         cells=len(cells) / (columns * rows),
         extent=extent,
     )

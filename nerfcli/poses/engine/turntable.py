@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, several
 from nerfcli.matching.features import LOOSE_RATIO, Features, find_features, mutual_matches
 from nerfcli.matching.stationary import Motions, Stationary, in_place, motions, together
 from nerfcli.photos.images import image_size, read_image
@@ -50,10 +50,9 @@ MASKS = "masks"
 
 @dataclass(frozen=True)
 class ComparedPair:
-    """Two photos by number, positions (N, 2) of matches in the first as fractions of its size, and their motions."""
+    """The first of two photos by number, positions (N, 2) of matches in it as fractions of its size, and motions."""
 
     first: int
-    second: int
     places: np.ndarray
     motions: Motions
 
@@ -178,8 +177,8 @@ def describe_motions(facts: dict[str, Any]) -> str:
             f"{text}; no masks of the object could be created, because {facts['why_not']}: give masks with --masks, "
             "white where the object is and black elsewhere"
         )
-    several = len(facts["unmasked"])
-    rest = f", except for {several} photos" if several else ""
+    unmasked = len(facts["unmasked"])
+    rest = f", except for {several(unmasked, 'photo')}" if unmasked else ""
     return f"{text}: its masks are in {MASKS}/ of the scene{rest}, and the poses are relative to the object"
 
 
@@ -203,7 +202,7 @@ def _compare_photos(photos: _Photos, numbers: Sequence[int]) -> list[ComparedPai
         for first, second in pairs:
             size = photos[first].size
             x, y = photos.matches(first, second)
-            found.append(ComparedPair(first, second, x / size, motions(x, y, size)))
+            found.append(ComparedPair(first, x / size, motions(x, y, size)))
         return found
 
     few_anchors, anchors = 6, 24
@@ -219,7 +218,7 @@ def _compare_photos(photos: _Photos, numbers: Sequence[int]) -> list[ComparedPai
 
 
 def _together(pairs: Sequence[ComparedPair]) -> Stationary:
-    return together([(pair.first, pair.second, pair.motions) for pair in pairs])
+    return together([pair.motions for pair in pairs])
 
 
 def _anchors(count: int, most: int) -> list[int]:
