@@ -4,11 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import example, given
-from hypothesis import strategies as st
 from test_stereo import LENS, NORMALS, PINHOLE, found, photo, truth
 
-from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.matching import pair_stereo
 from nerfcli.matching.pair_stereo import forward_depths
 from nerfcli.matching.stereo_view import view_of
@@ -87,18 +84,6 @@ def test_pairs_without_forward_motion_or_points_are_left_alone(case):
 def test_views_in_opposite_directions_are_left_alone():
     one, other = photo(0.0), photo(0.0, z=0.5, turned=np.pi)
     assert forward_depths(view_of(one, 200), view_of(other, 200), walls()) is None
-
-
-@example([0.0, 0.0, 0.0], 0)
-@example([0.0, 0.0, 0.0], 1)
-@given(st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3), st.integers(0, 2**31))
-def test_axes_are_a_rotation_along_the_baseline(vector, seed):
-    axis = np.random.default_rng(seed).normal(size=3)
-    axis = np.eye(3)[seed] if seed < 3 else axis / np.linalg.norm(axis)
-    axes = pair_stereo._axes(axis, rotation_from_vector(np.array(vector)))
-    assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-9)
-    assert np.linalg.det(axes) == pytest.approx(1.0)
-    assert axes[2] == pytest.approx(axis)
 
 
 def test_points_at_twice_the_distance_of_the_second_camera_are_shifted_by_the_logarithm_of_two():
