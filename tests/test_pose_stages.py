@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
+from errno import ENOSPC
 from itertools import pairwise
 from pathlib import Path
 
@@ -26,6 +27,7 @@ import nerfcli
 from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.machine import default_memory_limit, resident_bytes, thread_count
 from nerfcli.poses import structure_from_motion
+from nerfcli.poses import workspace as workspace_module
 from nerfcli.poses.input.job import read_job, read_stage, write_stage
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport
@@ -267,6 +269,21 @@ def test_damaged_stages_are_done_again(photos: Path, whole: Path, again: Path):
     (again / "poses_report.json").write_text("[]")
     assert not is_same_scene(again, photos, ONE_THREAD)
     _holds_the_same_again(photos, whole, again)
+
+
+@pytest.mark.usefixtures("same_process")
+def test_a_disk_that_is_full_when_a_scene_is_replaced_leaves_the_earlier_one(
+    photos: Path, unpublished: Path, again: Path, monkeypatch: pytest.MonkeyPatch
+):
+    shutil.copytree(unpublished / "work", again / "work", dirs_exist_ok=True)
+
+    def full(source: Path, target: Path) -> None:
+        raise OSError(ENOSPC, "No space left on device", str(target))
+
+    monkeypatch.setattr(workspace_module.shutil, "copytree", full)
+    with pytest.raises(UserError, match="No space left"):
+        estimate(photos, again)
+    assert is_same_scene(again, photos, ONE_THREAD)
 
 
 def test_the_database_is_one_that_colmap_reads_with_the_users_photos(whole: Path, photos: Path):

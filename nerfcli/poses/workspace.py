@@ -57,12 +57,12 @@ def is_under_construction(scene_dir: Path) -> bool:
 def publish(scene_dir: Path, describe: Callable[[], None]) -> None:
     """Copy the worker's model into the scene; then `describe` writes the report and, last, scene.json.
 
-    Until then the folder is not a scene, and another call continues from the complete model.
+    In between, the folder is not a scene, and another call continues from the complete model.
     """
     work = scene_dir / "work"
-    (scene_dir / SCENE_FILE).unlink(missing_ok=True)
     with atomic_folder(scene_dir / "sparse") as sparse:
         shutil.copytree(work / "sparse" / "0", sparse / "0")
+        (scene_dir / SCENE_FILE).unlink(missing_ok=True)  # an earlier scene stays if the disk is full
     describe()
     shutil.rmtree(scene_dir / REFUSED, ignore_errors=True)
     for path in work.iterdir():
