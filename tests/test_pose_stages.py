@@ -28,6 +28,7 @@ from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.machine import default_memory_limit, resident_bytes, thread_count
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses import workspace as workspace_module
+from nerfcli.poses.engine.database import remove_database
 from nerfcli.poses.input.job import read_job, read_stage, write_stage
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport
@@ -284,6 +285,14 @@ def test_a_disk_that_is_full_when_a_scene_is_replaced_leaves_the_earlier_one(
     with pytest.raises(UserError, match="No space left"):
         estimate(photos, again)
     assert is_same_scene(again, photos, ONE_THREAD)
+
+
+def test_a_backup_of_a_database_is_not_removed_with_it(tmp_path: Path):
+    kept = {"database.db.bak", "database.db-copy"}
+    for name in (*kept, "database.db", "database.db-wal", "database.db-shm", "database.db-journal"):
+        (tmp_path / name).touch()
+    remove_database(tmp_path / "database.db")
+    assert {path.name for path in tmp_path.iterdir()} == kept
 
 
 def test_the_database_is_one_that_colmap_reads_with_the_users_photos(whole: Path, photos: Path):

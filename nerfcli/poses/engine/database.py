@@ -127,8 +127,8 @@ def discard_if_damaged(path: Path) -> None:
 
 def remove_database(path: Path) -> None:
     """Remove a database, if it exists, with the logs that SQLite keeps beside it."""
-    for part in path.parent.glob(path.name + "*"):
-        part.unlink()
+    for log in ("", "-wal", "-shm", "-journal"):
+        path.with_name(path.name + log).unlink(missing_ok=True)
 
 
 def name_images(job: Job) -> None:
