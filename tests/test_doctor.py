@@ -35,6 +35,7 @@ from nerfcli.doctor.page import page_html
 from nerfcli.doctor.photo_facts import PhotoFacts, Source, measure_sharpness, read_photo
 from nerfcli.errors import UserError
 from nerfcli.matching.features import LOOSE_RATIO, mutual_matches
+from nerfcli.matching.graph import potentials
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding
 from nerfcli.photos.exif import Exif
 
@@ -348,7 +349,7 @@ def test_heights_come_back_from_differences_of_which_some_are_wrong():
     differences = np.array([truth[j] - truth[i] for i, j in pairs])
     differences[::9] += 5
     differences[4] = np.nan
-    values, backing = quality.potentials(12, pairs, differences, trust=np.ones(len(pairs)))
+    values, backing = potentials(12, pairs, differences, trust=np.ones(len(pairs)), usual_error=0.1)
     np.testing.assert_allclose(values[:11], truth[:11] - np.median(truth[:11]), atol=0.1)  # squares below 0.1
     assert np.isnan(values[11])
     assert backing[11] == 0

@@ -7,7 +7,7 @@ import numpy as np
 from nerfcli.doctor.compared_pairs import FEWEST_PAIRS, Pair
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
-from nerfcli.matching.graph import connected_groups
+from nerfcli.matching.graph import potentials
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, finding, verdict_above, verdict_below, worst
 
 # log2 of the detail that a photo lacks relative to the others: a Gaussian blur of about 0.8 px takes 0.3 from a sharp
@@ -37,9 +37,8 @@ def lacking_detail(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> np.nd
     own = np.array([photo.sharpness.detail for photo in photos])
     reference = np.nanmedian(own) if not np.isnan(own).all() else 0.0
     linked = [pair for pair in pairs if pair.linked]
-    places = [(pair.first, pair.second) for pair in linked]
     trust = np.array([pair.inliers for pair in linked], dtype=np.float64)
-    matched, backing = potentials(len(photos), places, np.array([pair.detail for pair in linked]), trust=trust)
+    matched, backing = _fitted(photos, linked, [pair.detail for pair in linked], trust)
     alone = reference - own
     both = (alone - matched) / 2
     # A photo without enough neighbours must lack more, since its content also plays a part.
@@ -97,12 +96,19 @@ def stops(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> tuple[np.ndarr
     At the same points, (photos,) each; NaN for photos without usable matches.
     """
     linked = [pair for pair in pairs if pair.linked]
-    places = [(pair.first, pair.second) for pair in linked]
     # A uniform change in brightness comes from the camera; highlights and shadows come from the scene.
     trust = np.array([pair.inliers / (0.05 + np.nan_to_num(pair.stops_spread)) for pair in linked])
-    brighter, _ = potentials(len(photos), places, np.array([pair.stops for pair in linked]), trust=trust)
-    redder, _ = potentials(len(photos), places, np.array([pair.red_blue_stops for pair in linked]), trust=trust)
+    brighter, _ = _fitted(photos, linked, [pair.stops for pair in linked], trust)
+    redder, _ = _fitted(photos, linked, [pair.red_blue_stops for pair in linked], trust)
     return brighter, redder
+
+
+def _fitted(
+    photos: Sequence[PhotoFacts], pairs: Sequence[Pair], differences: Sequence[float], trust: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a number for each photo that fits the differences of pairs, and how many of these are known of it."""
+    places = [(pair.first, pair.second) for pair in pairs]
+    return potentials(len(photos), places, np.array(differences), trust=trust, usual_error=_TYPICAL_ERROR)
 
 
 def exposure(photos: Sequence[PhotoFacts], brighter: np.ndarray) -> Finding:
@@ -180,45 +186,3 @@ def clipping(photos: Sequence[PhotoFacts]) -> Finding:
     advice = "expose so that the subject is neither white nor black, which cannot be matched; a background may be"
     remarks = tuple((name, what) for _, name, what in sorted(flagged, key=lambda item: -item[0]))
     return Finding("clipping", verdict, summary, len(flagged) / len(photos), threshold, advice, remarks)
-
-
-def potentials(
-    count: int, pairs: Sequence[tuple[int, int]], differences: np.ndarray, *, trust: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate a number v per photo such that v_j - v_i fits the differences (weighted least absolute deviations), as
-    heights are found in a levelling survey.
-
-    In each connected group of photos v is determined up to a constant, which makes its median 0.
-
-    Args:
-        pairs: (i, j) of each difference.
-        differences: (len(pairs),) second minus first; NaN where unknown.
-        trust: (len(pairs),) positive weights.
-
-    Returns:
-        v (count,), NaN for photos without a known difference; and the number of known differences of each photo.
-    """
-    measured = ~np.isnan(differences)
-    i, j = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)[measured].T
-    differences, trust = differences[measured], trust[measured]
-    backing = np.bincount(np.concatenate([i, j]), minlength=count)
-    values = np.zeros(count)
-    weights = trust / max(trust.mean(), 1e-9) if len(trust) else trust
-    for _ in range(10):
-        laplacian = np.zeros((count, count))
-        np.add.at(laplacian, (i, i), weights)
-        np.add.at(laplacian, (j, j), weights)
-        np.add.at(laplacian, (i, j), -weights)
-        np.add.at(laplacian, (j, i), -weights)
-        right = np.bincount(j, weights * differences, minlength=count)
-        right -= np.bincount(i, weights * differences, minlength=count)
-        # A slight pull to 0 fixes the constant of each connected group.
-        values = np.linalg.solve(laplacian + 1e-6 * np.eye(count), right)
-        residuals = np.abs(values[j] - values[i] - differences)
-        weights = trust / trust.mean() / np.maximum(residuals, _TYPICAL_ERROR) if len(trust) else trust
-    values[backing == 0] = np.nan
-    for members in connected_groups(range(count), zip(i.tolist(), j.tolist(), strict=True)):
-        backed = [member for member in members if backing[member]]
-        if backed:
-            values[backed] -= np.median(values[backed])
-    return values, backing

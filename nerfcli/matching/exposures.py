@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from nerfcli.cameras.rigid import apply, inverse
-from nerfcli.matching.graph import connected_groups
+from nerfcli.matching.graph import connected_groups, potentials
 from nerfcli.matching.stereo import CONSISTENT, DenseDepth
 from nerfcli.photos.colours import linear_light
 from nerfcli.photos.loading import LoadedPhoto
@@ -70,24 +70,10 @@ def _light(levels: np.ndarray) -> np.ndarray:
 def _gains(count: int, pairs: np.ndarray, ratios: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Fit log gains (count, 3) to log ratios (N, 3) of pairs (N, 2); NaN outside the largest connected group."""
     gains = np.full((count, 3), np.nan)
-    group = connected_groups(range(count), [tuple(pair) for pair in pairs.tolist()])[0] if count else []
+    group = connected_groups(range(count), pairs.tolist())[0] if count else []
     if len(group) < 2:
         return gains
-    inside = np.isin(pairs[:, 0], group)
-    place = np.full(count, -1)
-    place[group] = np.arange(len(group))
-    first, second = place[pairs[inside]].T
-    design = np.zeros((len(first) + 1, len(group)))
-    design[np.arange(len(first)), second] = 1.0
-    design[np.arange(len(first)), first] -= 1.0
-    design[-1] = 1.0  # the mean log gain is 0
-    for channel in range(3):
-        wanted = np.append(ratios[inside, channel], 0.0)
-        robust, found = np.ones(len(first)), np.zeros(len(group))
-        for _ in range(5):
-            root = np.append(np.sqrt(weights[inside] * robust), 1.0)
-            weighted = design * root[:, None]
-            found = np.linalg.solve(weighted.T @ weighted, weighted.T @ (wanted * root))
-            robust = 1.0 / np.maximum(np.abs(design[:-1] @ found - wanted[:-1]), 0.01)
-        gains[group, channel] = found
+    for channel, ratio in enumerate(ratios.T):
+        found, _ = potentials(count, pairs, ratio, trust=weights, usual_error=0.01)
+        gains[group, channel] = found[group] - found[group].mean()
     return gains

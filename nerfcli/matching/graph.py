@@ -1,4 +1,4 @@
-"""Photos as a graph: groups that are connected by joins, and the strength of their connections.
+"""Photos as a graph: groups that are connected by joins, the strength of their connections, numbers from differences.
 
 The strength of the join of two photos is the number of their matches. A chain of joins is as strong as its weakest
 join; the bottleneck of two photos is the strongest chain between them.
@@ -89,3 +89,51 @@ def consistent_groups(photos: Sequence[int], joins: Iterable[Join]) -> list[list
     order = {photo: index for index, photo in enumerate(photos)}
     groups = [sorted(group, key=order.__getitem__) for group in members.values()]
     return sorted(groups, key=lambda group: (-len(group), order[group[0]]))
+
+
+def potentials(
+    count: int,
+    pairs: np.ndarray | Sequence[tuple[int, int]],
+    differences: np.ndarray,
+    *,
+    trust: np.ndarray,
+    usual_error: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Estimate a number v per photo such that v_j - v_i fits the differences (weighted least absolute deviations), as
+    heights are found in a levelling survey.
+
+    In each connected group of photos v is determined up to a constant, which makes its median 0.
+
+    Args:
+        pairs: (i, j) of each difference.
+        differences: (len(pairs),) second minus first; NaN where unknown.
+        trust: (len(pairs),) positive weights.
+        usual_error: of a difference; larger residuals weigh less.
+
+    Returns:
+        v (count,), NaN for photos without a known difference; and the number of known differences of each photo.
+    """
+    measured = ~np.isnan(differences)
+    i, j = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)[measured].T
+    differences, trust = differences[measured], trust[measured]
+    backing = np.bincount(np.concatenate([i, j]), minlength=count)
+    values = np.zeros(count)
+    weights = trust / max(trust.mean(), 1e-9) if len(trust) else trust
+    for _ in range(10):
+        laplacian = np.zeros((count, count))
+        np.add.at(laplacian, (i, i), weights)
+        np.add.at(laplacian, (j, j), weights)
+        np.add.at(laplacian, (i, j), -weights)
+        np.add.at(laplacian, (j, i), -weights)
+        right = np.bincount(j, weights * differences, minlength=count)
+        right -= np.bincount(i, weights * differences, minlength=count)
+        # A slight pull to 0 fixes the constant of each connected group.
+        values = np.linalg.solve(laplacian + 1e-6 * np.eye(count), right)
+        residuals = np.abs(values[j] - values[i] - differences)
+        weights = trust / trust.mean() / np.maximum(residuals, usual_error) if len(trust) else trust
+    values[backing == 0] = np.nan
+    for members in connected_groups(range(count), zip(i.tolist(), j.tolist(), strict=True)):
+        backed = [member for member in members if backing[member]]
+        if backed:
+            values[backed] -= np.median(values[backed])
+    return values, backing
