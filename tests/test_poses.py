@@ -242,6 +242,17 @@ def test_a_scene_never_takes_the_place_of_the_photos(tmp_path: Path):
     assert len(list((tmp_path / "photos").iterdir())) == 5
 
 
+def test_a_folder_that_cannot_be_written_is_refused_before_photos_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    write_noise(tmp_path / "photos")
+    stages: list[str] = []
+    monkeypatch.setattr("nerfcli.atomic.os.access", lambda path, mode: False)
+    with pytest.raises(UserError, match="no write permission"):
+        estimate(tmp_path / "photos", tmp_path / "scene", lambda stage, done, total: stages.append(stage))
+    assert stages == []
+
+
 def test_a_folder_that_is_no_scene_is_not_replaced(tmp_path: Path):
     write_noise(tmp_path / "photos")
     (tmp_path / "thesis").mkdir()

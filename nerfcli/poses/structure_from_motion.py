@@ -74,8 +74,8 @@ def estimate_poses(
             reached, or pycolmap died.
     """
     start = time.perf_counter()
-    photos, grouped, pairing, plan = plan_poses(photos_dir, settings=settings, progress=progress, given=given)
     check_destination(scene_dir, photos_dir, subfolders=settings.subfolders)
+    photos, grouped, pairing, plan = plan_poses(photos_dir, settings=settings, progress=progress, given=given)
     for note in photo_notes(photos, grouped):
         notify(note)
     planned(plan)

@@ -18,7 +18,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from nerfcli.atomic import atomic_folder, clear_leftovers, exclusive
+from nerfcli.atomic import atomic_folder, clear_leftovers, exclusive, refuse_read_only
 from nerfcli.captures.calibration import Calibration
 from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.errors import UserError
@@ -89,7 +89,7 @@ def database_bytes(scene_dir: Path) -> int:
 
 
 def check_destination(scene_dir: Path, photos_dir: Path, *, subfolders: bool) -> None:
-    """Refuse a destination that contains anything other than a scene, since the scene replaces it."""
+    """Refuse a destination that cannot be written, or contains anything but a scene, since the scene replaces it."""
     scene_path, photos_path = scene_dir.resolve(), photos_dir.resolve()
     hint = "choose another folder with -o"
     if photos_path.is_relative_to(scene_path):
@@ -103,6 +103,7 @@ def check_destination(scene_dir: Path, photos_dir: Path, *, subfolders: bool) ->
     ours = (scene_dir / SCENE_FILE).is_file() or is_under_construction(scene_dir)
     if scene_dir.is_dir() and any(scene_dir.iterdir()) and not ours:
         raise UserError(f"cannot write the scene {scene_dir}: the folder contains other files", hint)
+    refuse_read_only(scene_dir / "work")
 
 
 def is_same_scene(
