@@ -24,13 +24,20 @@ from nerfcli.poses.model import merging
 
 
 @pytest.fixture(scope="module")
-def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
+def matched(tmp_path_factory: pytest.TempPathFactory) -> Job:
     """Eight photos with features and matches."""
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     folder = tmp_path_factory.mktemp("capture")
     views = synthetic.ring(8, [WIDE], seed=0, turn_deg=160)
     synthetic.write_database(folder / "database.db", views, synthetic.boulder(700, seed=0), noise=Noise(), seed=0)
     return synthetic.synthetic_job(folder, views, seed=0)
+
+
+@pytest.fixture
+def job(matched: Job, tmp_path: Path) -> Job:
+    """The same in a folder that may be changed."""
+    shutil.copytree(matched.database.parent, tmp_path / "again")
+    return replace(matched, folder=str(tmp_path / "again" / "work"))
 
 
 def looked_at(job: Job) -> set[tuple[int, int]]:
@@ -52,12 +59,8 @@ def test_pairs_of_photos_near_in_the_order_come_first():
     assert apart == sorted(apart)
 
 
-def test_matching_ends_at_its_limit_and_the_next_call_does_the_rest(
-    job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_matching_ends_at_its_limit_and_the_next_call_does_the_rest(job: Job, monkeypatch: pytest.MonkeyPatch):
     """The clock advances by 80 s at each reading and the limit is 120 s: time for one batch of 10 pairs."""
-    shutil.copytree(job.database.parent, tmp_path / "again")
-    job = replace(job, folder=str(tmp_path / "again" / "work"))
     clear_matches(job, "matches", "two_view_geometries")
     pairs = sorted(all_pairs(8))
     with monkeypatch.context() as patched:
@@ -71,9 +74,7 @@ def test_matching_ends_at_its_limit_and_the_next_call_does_the_rest(
     assert looked_at(job) == set(pairs)
 
 
-def test_what_was_cut_short_is_kept_with_the_models(job: Job, tmp_path: Path):
-    shutil.copytree(job.database.parent, tmp_path / "again")
-    job = replace(job, folder=str(tmp_path / "again" / "work"))
+def test_what_was_cut_short_is_kept_with_the_models(job: Job):
     mapped = map_with_fallbacks(job, lambda *progress: None)
     assert mapped.cut_short == ()
     write_mapped(replace(mapped, cut_short=("matching: 1 of 28 pairs",)), mapping_key(job))
@@ -82,13 +83,11 @@ def test_what_was_cut_short_is_kept_with_the_models(job: Job, tmp_path: Path):
     assert again.cut_short == ("matching: 1 of 28 pairs",)
 
 
-def test_no_attempt_begins_after_the_time_for_all(job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_no_attempt_begins_after_the_time_for_all(job: Job, monkeypatch: pytest.MonkeyPatch):
     """Three of eight photos are not placed, so others would be tried; the clock advances by 250 s at each reading.
 
     All attempts together may take 240 s: the second reading is too late.
     """
-    shutil.copytree(job.database.parent, tmp_path / "again")
-    job = replace(job, folder=str(tmp_path / "again" / "work"))
     real = attempts.map_photos
 
     def without_three(*arguments, **options) -> list[pycolmap.Reconstruction]:
@@ -109,13 +108,10 @@ def test_no_attempt_begins_after_the_time_for_all(job: Job, tmp_path: Path, monk
     assert notes.count(f"cut short: {said}") == 1
 
 
-def test_a_way_to_map_that_was_ended_is_reported_and_a_check_once(
-    job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_way_to_map_that_was_ended_is_reported_and_a_check_once(job: Job, monkeypatch: pytest.MonkeyPatch):
     """The worker was ended before in two stages: one is a check of the accepted model, the other is a mapper."""
-    shutil.copytree(job.database.parent, tmp_path / "again")
     ended = (("pose uncertainty", "it took longer than 5 min"), ("global mapper", "it took longer than 2 min"))
-    job = replace(job, folder=str(tmp_path / "again" / "work"), skipped_checks=ended)
+    job = replace(job, skipped_checks=ended)
     # There are no photos: their features are in the database already.
     monkeypatch.setattr(worker, "extract", lambda job, report: None)
     monkeypatch.setattr(worker, "mask_turning_object", lambda job, training: (job, None))

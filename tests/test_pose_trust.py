@@ -639,16 +639,20 @@ def test_a_fisheye_without_metadata_is_recognized(tmp_path: Path):
     assert camera.mean_focal_length() == pytest.approx(UNKNOWN_FISHEYE.params[0], rel=0.02)
 
 
-def test_a_wrong_focal_length_in_exif_is_ignored(tmp_path: Path):
-    """EXIF's is six times too long, as by a stale sensor resolution; without it, all photos are placed correctly."""
-    views = synthetic.ring(8, [WIDE], seed=0, turn_deg=120)
-    synthetic.write_database(tmp_path / "database.db", views, synthetic.boulder(700, seed=0), noise=Noise(), seed=0)
-    job = synthetic.synthetic_job(tmp_path, views, seed=0)
-    groups = tuple(replace(group, focal_px=6 * WIDE.params[0], focal_is_prior=True) for group in job.groups)
-    notes: list[str] = []
-    job = replace(job, groups=groups)
+def with_exif(folder: Path, views: Sequence[View], *, focal_px: float) -> Job:
+    """Return the job of photos of a boulder, verified with a focal length from EXIF."""
+    synthetic.write_database(folder / "database.db", views, synthetic.boulder(700, seed=0), noise=Noise(), seed=0)
+    job = synthetic.synthetic_job(folder, views, seed=0)
+    job = replace(job, groups=tuple(replace(g, focal_px=focal_px, focal_is_prior=True) for g in job.groups))
     register_photos(job)
     match(job, job.pairs, lambda *progress: None)
+    return job
+
+
+def test_a_wrong_focal_length_in_exif_is_ignored(tmp_path: Path):
+    """EXIF's is six times too long, as by a stale sensor resolution; without it, all photos are placed correctly."""
+    notes: list[str] = []
+    job = with_exif(tmp_path, synthetic.ring(8, [WIDE], seed=0, turn_deg=120), focal_px=6 * WIDE.params[0])
     mapped = map_with_fallbacks(job, lambda *progress: None, notes.append)
     assert [attempt["what"] for attempt in mapped.attempts] == ["default thresholds", "without EXIF's focal length"]
     assert mapped.attempts[0]["models"] == [] or max(mapped.attempts[0]["models"]) < 4
@@ -665,12 +669,7 @@ def test_a_camera_whose_photos_are_not_registered_is_no_error(tmp_path: Path):
     """EXIF's focal lengths are 20 and 10 times too long, and all photos of the second camera show something else."""
     views = synthetic.ring(8, [WIDE], seed=0, turn_deg=120)
     views += synthetic.turned_away([View(LONG, view.cam_from_world) for view in views[:2]])
-    synthetic.write_database(tmp_path / "database.db", views, synthetic.boulder(700, seed=0), noise=Noise(), seed=0)
-    job = synthetic.synthetic_job(tmp_path, views, seed=0)
-    groups = tuple(replace(group, focal_px=20 * WIDE.params[0], focal_is_prior=True) for group in job.groups)
-    job = replace(job, groups=groups)
-    register_photos(job)
-    match(job, job.pairs, lambda *progress: None)
+    job = with_exif(tmp_path, views, focal_px=20 * WIDE.params[0])
     notes: list[str] = []
     mapped = map_with_fallbacks(job, lambda *progress: None, notes.append)
     assert len(job.groups) == 2
