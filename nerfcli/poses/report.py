@@ -36,8 +36,7 @@ class PosesReport:
     """Content of poses_report.json, with the same names.
 
     verdict: whether the result is accepted, why not, and all measurements (see `acceptance`). pose_blur_px: median,
-    largest, and the photo that has the largest. lenses: the lens models tried for each camera, with held-out errors.
-    parts: sizes of the groups of photos connected by matches.
+    largest, and the photo that has the largest. parts: sizes of the groups of photos connected by matches.
     seconds: per stage, for the call that wrote the report; time spent in earlier calls is not included. models: the
     sizes of all models found, the kept one first. attempts: the result of each mapping attempt. matching: the rule
     for pairs, their number, and hashes of the photos, masks and files that were used. points: number of points of the
@@ -63,7 +62,6 @@ class PosesReport:
     versions: dict[str, str]
     verdict: dict[str, Any]
     pose_blur_px: dict[str, Any] | None
-    lenses: tuple[dict[str, Any], ...] = ()
     parts: tuple[int, ...]
     intrinsics: dict[str, Any] | None = None
     strict: dict[str, Any] | None = None

@@ -11,7 +11,7 @@ camera's axes, and the change of t; J maps them to pixels; a similarity has thet
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -86,9 +86,8 @@ def examine(
         "contradicting photos", lambda: leave_out_contradicting(mapped, [*pairs, *held]), otherwise=(mapped, {})
     )
     report("check", 1, 4)
-    lenses = checks.run("lens models", lambda: _with_lenses(model, job), otherwise=ModelLenses(model, [], {}))
+    lenses = checks.run("lens models", lambda: _with_lenses(model, job), otherwise=ModelLenses(model, {}))
     model = lenses.model
-    details["lenses"] = [asdict(candidate) for candidate in lenses.candidates]
     report("check", 2, 4)
     verdict = judge(
         model,

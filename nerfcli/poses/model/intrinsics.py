@@ -20,7 +20,6 @@ from nerfcli.poses.input.job import Solver
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.lens_evidence import UndeterminedError, lenses_of, parameters_of
 from nerfcli.poses.model.lens_observability import (
-    Candidate,
     DeterminedLens,
     determine_lens,
     has_open_distortion,
@@ -59,10 +58,9 @@ class _Trial:
 
 @dataclass(frozen=True)
 class ModelLenses:
-    """A model with the chosen lenses, the decisions, and each lens's uncertainty by camera id, for the report."""
+    """A model with the chosen lenses, and each lens's uncertainty by camera id, for the report."""
 
     model: pycolmap.Reconstruction
-    candidates: list[Candidate]
     uncertainty: dict[int, dict[str, Any]]
 
 
@@ -82,7 +80,6 @@ def choose_lenses(
     """
     photos = Counter(lenses_of(model).values())
     cameras = [c for c, count in photos.most_common() if c not in solver.fixed and count >= LEAST_PHOTOS]
-    candidates: list[Candidate] = []
     freed: list[int] = []
     held: dict[int, DeterminedLens] = {}
     result = pycolmap.Reconstruction(model)
@@ -104,11 +101,9 @@ def choose_lenses(
             held[camera_id] = found
             continue
         if found is None or wide:
-            best, tried = _choose_by_held_out(result, camera_id, solver, named=camera_id in named)
-            candidates.extend(tried)
+            best = _choose_by_held_out(result, camera_id, solver, named=camera_id in named)
             lens, free = best.model.cameras[camera_id], best.principal_point
         else:
-            candidates.extend(found.steps)
             lens, free = found.camera, found.principal_point
         _set_lens(camera, lens)
         freed += [camera_id] if free else []
@@ -133,7 +128,7 @@ def choose_lenses(
         )
         for camera_id, _ in photos.most_common(MOST_CAMERAS)
     }
-    return ModelLenses(result, candidates, certain)
+    return ModelLenses(result, certain)
 
 
 def _with_held(
@@ -160,13 +155,12 @@ def _with_held(
             camera.model = pycolmap.CameraModelId.SIMPLE_PINHOLE
             camera.params = kept
     chosen = choose(start, replace(solver, fixed=(*solver.fixed, *held)))
-    decided = [decision for found in held.values() for decision in found.steps]
     certain = {
         camera_id: uncertainty(chosen.model, camera_id, solver, principal_point=False)
         for camera_id in held
         if camera_id in chosen.uncertainty
     }
-    return ModelLenses(chosen.model, [*decided, *chosen.candidates], chosen.uncertainty | certain)
+    return ModelLenses(chosen.model, chosen.uncertainty | certain)
 
 
 def _set_lens(camera: pycolmap.Camera, lens: pycolmap.Camera) -> None:
@@ -232,9 +226,7 @@ def _field_by_exif_deg(camera: pycolmap.Camera, exif_focal_px: float | None) -> 
     return float(2 * np.degrees(np.arctan(np.hypot(camera.width, camera.height) / 2 / exif_focal_px)))
 
 
-def _choose_by_held_out(
-    model: pycolmap.Reconstruction, camera_id: int, solver: Solver, *, named: bool
-) -> tuple[_Trial, list[Candidate]]:
+def _choose_by_held_out(model: pycolmap.Reconstruction, camera_id: int, solver: Solver, *, named: bool) -> _Trial:
     """Adjust a model with one lens model of a camera after the other, each compared with the best one before it.
 
     The principal point comes before the tangential terms: both shift the picture, but real cameras have sensors off the
@@ -250,7 +242,6 @@ def _choose_by_held_out(
     if named:
         names = (camera.model.name, None)
     best: _Trial | None = None
-    tried: list[Candidate] = []
     for name in names:
         trial = pycolmap.Reconstruction(training if best is None else best.model)
         camera = trial.cameras[camera_id]
@@ -260,14 +251,11 @@ def _choose_by_held_out(
         others = tuple(c for c in trial.cameras if c != camera_id) if free else solver.fixed
         held_out.adjust(trial, replace(solver, fixed=others), principal_points=free)
         errors = np.minimum(held_out.errors_px(trial, held)[mine], held_out.MOST_ERROR_PX)
-        gain = None if best is None else held_out.gain(best.errors, errors)
-        kept = best is None or bool(
+        if best is None or (
             held_out.gain(best.errors, errors) > DEVIATIONS
             and errors.mean() < (1 - _GAIN_FRACTION) * best.errors.mean()
             and is_centred(camera)
-        )
-        error = float(errors.mean()) if len(errors) else None
-        tried.append(Candidate(camera_id, camera.model.name, free, error, gain, None, kept))
-        best = _Trial(trial, free, errors) if kept or best is None else best
+        ):
+            best = _Trial(trial, free, errors)
     assert best is not None
-    return best, tried
+    return best

@@ -55,25 +55,6 @@ _MODELS = {
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A lens model that was tried for a camera, or a decision by which parameters the observations determine.
-
-    held_out_px: where fisheyes are tried, mean error of this camera's held-out observations, each clipped to 4 px.
-    gain: how many standard errors that is below the model kept before it. significance: of the decisions by parameters,
-    the squared distance of the added ones from zero in units of their uncertainty, relative to the required one: they
-    are added above 1; None for the model to which the others are added. kept: whether it was chosen.
-    """
-
-    camera: int
-    model: str
-    principal_point: bool
-    held_out_px: float | None
-    gain: float | None
-    significance: float | None
-    kept: bool
-
-
-@dataclass(frozen=True)
 class DeterminedLens:
     """Lens parameters that a capture determines.
 
@@ -81,13 +62,11 @@ class DeterminedLens:
         camera: the camera with the parameters as estimated in one step, from which an adjustment starts.
         principal_point: whether it is free.
         held: whether the focal length stays as it is in `camera`, since the observations leave it open.
-        steps: the decisions, in their order.
     """
 
     camera: pycolmap.Camera
     principal_point: bool
     held: bool
-    steps: tuple[Candidate, ...]
 
 
 def determine_lens(
@@ -111,36 +90,28 @@ def determine_lens(
     """
     camera = model.cameras[camera_id]
     evidence = lens_evidence(model, camera_id, solver)
-
-    def decision(names: Sequence[str], distance: float | None, *, taken: bool) -> Candidate:
-        name = camera.model.name if named else _model_name(names)
-        return Candidate(camera_id, name, "cx" in names, None, None, distance, taken)
-
     free = list(parameters_of(camera)) if named else ["f", "k1"]
-    steps = [decision(free, None, taken=True)]
     # The principal point comes first: real cameras have sensors off the axis, and tangential terms imitate that.
     # It is tested again once k2 is free, whose absence may have hidden it.
-    for group in [_PRINCIPAL_POINT] if named else [_PRINCIPAL_POINT, ("k2",), _PRINCIPAL_POINT, _TANGENTIAL]:
-        if set(group) <= set(free) or (len(steps) > 2 and "k2" not in free):
+    groups = [_PRINCIPAL_POINT] if named else [_PRINCIPAL_POINT, ("k2",), _PRINCIPAL_POINT, _TANGENTIAL]
+    for number, group in enumerate(groups):
+        if set(group) <= set(free) or (number > 1 and "k2" not in free):
             continue
-        distance = _relative_distance(evidence, free, group, camera)
-        tried = [*free, *group]
-        steps.append(decision(tried, distance, taken=distance > 1))
-        free = tried if distance > 1 else free
+        if _relative_distance(evidence, free, group, camera) > 1:
+            free = [*free, *group]
     found = evidence.estimate(free)
     # If the focal length is undetermined, so is distortion: neither can be estimated without the other.
     fraction = found.deviation("f") / camera.mean_focal_length()
     if not named and not fraction <= (_OPEN_DEVIATION if exif_focal_px is None else _EXIF_DEVIATION):
         focal_px = exif_focal_px or _between_px(mapped, camera_id, solver)
-        return DeterminedLens(_held(mapped.cameras[camera_id], focal_px), False, True, tuple(steps))
+        return DeterminedLens(_held(mapped.cameras[camera_id], focal_px), principal_point=False, held=True)
     if not named and "k2" not in free and fraction <= _EXIF_DEVIATION:
         distance = found.distance(["k1"]) / float(chdtri(1, _CHANCE))
         if distance <= 1 and not _is_harmless(evidence, found, camera):
             free = [name for name in free if name != "k1"]
-            steps.append(decision(free, distance, taken=True))
             # The current value of k1 goes to zero, and the other parameters follow.
             found = evidence.without("k1").estimate(free)
-    return DeterminedLens(_camera(camera, found, named=named), "cx" in free, False, tuple(steps))
+    return DeterminedLens(_camera(camera, found, named=named), principal_point="cx" in free, held=False)
 
 
 def refine_lens(model: pycolmap.Reconstruction, lens: int, own: OwnCameras, solver: Solver) -> pycolmap.Camera | None:
