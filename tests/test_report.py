@@ -298,7 +298,7 @@ def test_numbers_that_must_not_be_compared_are_named():
 def test_everything_that_was_warned_about_is_listed():
     poses = {
         "images": [{"name": "c.png", "registered": False, "reason": "too few matches"}, {"registered": True}],
-        "verdict": {"failures": ["the focal length is 9 times the width"]},
+        "verdict": {"failures": [{"kind": "implausible", "evidence": "the focal length is 9 times the width"}]},
         "attempts": [{"what": "default thresholds"}, {"what": "full size"}],
         "pose_blur_px": {"largest": 3.21, "photo": "d.png"},
     }
@@ -308,7 +308,12 @@ def test_everything_that_was_warned_about_is_listed():
     run.log.append(logged(30, 0.01, rollbacks=2))
     reported = [f"{stage}: {text}" for stage, text in warnings_of(run)]
     for part in (
-        *("c.png (too few matches)", "9 times the width", "2 attempts", "d.png is uncertain by 3.2 px"),
+        *(
+            "c.png (too few matches)",
+            "poses: implausible: the focal length is 9 times the width",
+            "2 attempts",
+            "d.png is uncertain by 3.2 px",
+        ),
         *("e.png", "intrinsics were halved", "non-finite 2 times", "nerfcli evaluate"),
     ):
         assert sum(part in text for text in reported) == 1, part

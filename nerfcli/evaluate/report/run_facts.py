@@ -131,7 +131,7 @@ def _of_poses(poses: dict[str, Any]) -> Iterator[tuple[str, str]]:
         reasons = [f"{image['name']} ({image.get('reason') or 'unknown reason'})" for image in left_out]
         yield "poses", f"{several(len(left_out), 'photo')} without a pose: {listed(reasons)}"
     for failure in poses.get("verdict", {}).get("failures", []):
-        yield "poses", str(failure)
+        yield "poses", f"{failure['kind']}: {failure['evidence']}"
     attempts = poses.get("attempts", [])
     if len(attempts) > 1:
         yield "poses", f"mapping took {len(attempts)} attempts: {', '.join(str(one.get('what')) for one in attempts)}"
