@@ -104,7 +104,7 @@ def seen(config: dict[str, Any]) -> dict[str, bool | None]:
 def test_the_ledger_says_what_each_way_to_poses_has_seen():
     together = seen({"history": {"command": "poses", "settings": {}}})
     assert (together["poses"], together["intrinsics"], together["points"]) == (True, True, True)
-    given = seen({"history": {"command": "poses", "settings": {}, "intrinsics": {"use": "fixed"}}})
+    given = seen({"history": {"command": "poses", "settings": {}, "intrinsics": {"file": "/a.txt", "key": "0"}}})
     assert (given["poses"], given["intrinsics"]) == (True, False)
     strict = seen({"history": {"command": "poses", "settings": {"strict": True}}})
     assert (strict["poses"], strict["intrinsics"], strict["points"]) == (False, False, False)

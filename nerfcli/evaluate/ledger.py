@@ -76,10 +76,9 @@ def _cameras(history: Mapping[str, Any] | None, kind: str) -> list[Entry]:
         how = "estimated from training photos only; held-out photos were located afterwards with everything else fixed"
         return [Entry(stage, False, how) for stage in stages]
     how = "estimated from all photos (nerfcli poses without --strict)"
-    given = history.get("intrinsics") or {}
-    fixed = given.get("use") == "fixed"
+    given = "intrinsics" in history
     return [
         Entry("poses", True, how),
-        Entry("intrinsics", False, "given and kept fixed") if fixed else Entry("intrinsics", True, how),
+        Entry("intrinsics", False, "given and kept fixed") if given else Entry("intrinsics", True, how),
         Entry("points", True, how),
     ]
