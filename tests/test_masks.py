@@ -16,6 +16,8 @@ from nerfcli.poses.engine.features import extract, feature_keys
 from nerfcli.poses.input.job import CameraGroup, Job, WorkMask, read_job, write_job
 from nerfcli.poses.input.layout import lay_out_masks
 from nerfcli.poses.input.photos import Photo, Photos, find_photos
+from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.poses.structure_from_motion import plan_poses
 
 WIDTH, HEIGHT = 120, 80
 
@@ -130,10 +132,17 @@ def test_a_folder_without_masks_is_reported(photos, masks, tmp_path):
     with pytest.raises(UserError, match="contains no mask for any photo") as error:
         laid_out(photos, masks, tmp_path / "work")
     assert "p 0.png.png or p 0.png" in error.value.hint
-    with pytest.raises(UserError, match="the mask folder"):
-        laid_out(photos, tmp_path / "absent", tmp_path / "work")
     with pytest.raises(UserError, match="contains photos, such as"):
         laid_out(photos, photos.folder, tmp_path / "work")
+
+
+def test_a_folder_that_does_not_exist_is_refused_before_photos_are_read(photos, tmp_path):
+    """In a dry run, too."""
+    stages: list[str] = []
+    settings = PoseSettings(masks=str(tmp_path / "absent"))
+    with pytest.raises(UserError, match=r"the mask folder .*absent does not exist"):
+        plan_poses(photos.folder, settings=settings, progress=lambda stage, *done: stages.append(stage))
+    assert stages == []
 
 
 def test_masks_may_be_in_the_folder_above_the_photos(photos, masks, tmp_path):

@@ -94,7 +94,7 @@ def lay_out_masks(
     `files` are the photos' names below the worker's folder of photos, `masks` is the user's folder.
 
     Raises:
-        UserError: no such folder, no mask in it for any photo, or masks that cannot be read or do not fit.
+        UserError: no mask in it for any photo, or masks that cannot be read or do not fit.
     """
     _check_folder(photos, masks)
     found = [find_mask(name, masks) for name in photos.names]
@@ -144,8 +144,6 @@ def write_no_mask(path: Path, size: tuple[int, int]) -> WorkMask:
 
 
 def _check_folder(photos: Photos, masks: Path) -> None:
-    if not masks.is_dir():
-        raise UserError(f"the mask folder {masks} does not exist", "give a folder with a mask for each photo")
     folder = photos.folder.resolve()
     inside = [name for name in photos.names if (folder / name).is_relative_to(masks.resolve())]
     if inside and masks.resolve().is_relative_to(folder):  # a folder above that of the photos may have the masks

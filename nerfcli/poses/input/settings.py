@@ -1,8 +1,10 @@
 """Settings of structure from motion."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from nerfcli.captures.holdout import DEFAULT_HOLDOUT
+from nerfcli.errors import UserError
 from nerfcli.machine import thread_count
 from nerfcli.poses.input.pairs import PAIRINGS
 
@@ -69,10 +71,11 @@ def for_panoramas(settings: PoseSettings) -> PoseSettings:
 
 
 def check_settings(settings: PoseSettings) -> None:
-    """Refuse values that would crash pycolmap.
+    """Refuse values that would crash pycolmap, and a folder of masks that does not exist.
 
     Raises:
         ValueError: a setting is out of its range.
+        UserError: there is no such folder.
     """
     if settings.max_image_size < 1 or settings.max_features < 1:
         raise ValueError(
@@ -84,3 +87,6 @@ def check_settings(settings: PoseSettings) -> None:
         raise ValueError(f"min_registered must be within 0...1, got {settings.min_registered}")
     if settings.pairing not in PAIRINGS:
         raise ValueError(f"pairing must be one of {', '.join(PAIRINGS)}, got {settings.pairing}")
+    if settings.masks is not None and not Path(settings.masks).is_dir():
+        hint = "give a folder with a mask for each photo"
+        raise UserError(f"the mask folder {settings.masks} does not exist", hint)
