@@ -19,6 +19,7 @@ from errno import ENOSPC
 from itertools import pairwise
 from pathlib import Path
 
+import pycolmap
 import pytest
 from corner import NAMES, write_capture
 from in_this_process import worker_in_this_process
@@ -331,16 +332,18 @@ def test_a_scene_is_the_same_as_long_as_its_photos_and_masks_are(photos: Path, a
     assert is_same_scene(again, photos, settings)
 
 
-def test_the_worker_gets_the_number_of_threads(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A pool of threads takes no -1, which stands for all of them."""
+def test_the_worker_gets_numbers_that_libraries_take(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A pool of threads takes no -1, which stands for all of them, and pycolmap no seed beyond 31 bits."""
 
     def run_worker(job_path: Path, **options: object) -> None:
-        assert read_job(job_path).threads == options["threads"] == thread_count(0)
+        job = read_job(job_path)
+        assert job.threads == options["threads"] == thread_count(0)
+        pycolmap.RANSACOptions(random_seed=job.seed + 200)  # attempts to map have their numbers added
         raise KilledError
 
     monkeypatch.setattr(structure_from_motion, "run_worker", run_worker)
     with pytest.raises(KilledError):
-        estimate(photos, tmp_path / "scene", replace(ONE_THREAD, threads=-1))
+        estimate(photos, tmp_path / "scene", replace(ONE_THREAD, threads=-1, seed=2**32 - 1))
 
 
 def test_two_calls_on_one_scene_do_not_meet(photos: Path, tmp_path: Path):

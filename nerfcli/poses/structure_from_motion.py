@@ -180,7 +180,7 @@ def _lay_out(
         neighbours=pairing.neighbours,
         max_image_size=settings.max_image_size,
         max_features=settings.max_features,
-        seed=settings.seed,
+        seed=settings.seed % 2**30,  # pycolmap's have 31 bits, and the numbers of attempts to map are added
         threads=settings.cores,
         masks=lay_out_masks(photos, files, masks, folder=work / "masks", notify=notify) if masks else (),
         held_out=tuple(sorted(photos.names.index(name) for name in held_out)),
