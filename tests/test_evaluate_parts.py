@@ -108,6 +108,8 @@ def test_the_ledger_says_what_each_way_to_poses_has_seen():
     assert (given["poses"], given["intrinsics"]) == (True, False)
     strict = seen({"history": {"command": "poses", "settings": {"strict": True}}})
     assert (strict["poses"], strict["intrinsics"], strict["points"]) == (False, False, False)
+    others = seen({"history": {"command": "poses", "settings": {"strict": True}}, "holdout": "block:0.15"})
+    assert (others["poses"], others["intrinsics"], others["points"]) == (None, None, None)
     foreign = seen({"history": {"from": "blender"}})
     assert (foreign["poses"], foreign["training"]) == (None, False)
     assert seen({})["poses"] is None

@@ -27,7 +27,7 @@ def leak_ledger(config: RunConfig) -> list[Entry]:
     cameras.
     """
     return [
-        *_cameras(config.history, str(config.scene_kind)),
+        *_cameras(config.history, str(config.scene_kind), config.holdout),
         Entry(
             "normalisation",
             True,
@@ -64,21 +64,22 @@ def _exposure(config: RunConfig) -> Entry:
     return Entry("exposure", False, how.get(chosen, str(chosen)))
 
 
-def _cameras(history: Mapping[str, Any] | None, kind: str) -> list[Entry]:
+def _cameras(history: Mapping[str, Any] | None, kind: str, holdout: str | None) -> list[Entry]:
     stages = ("poses", "intrinsics", "points")
     if history is None:
         return [Entry(stage, None, "this run was trained before nerfcli recorded this") for stage in stages]
     if history.get("command") != "poses":
         source = history.get("from", kind)
         return [Entry(stage, None, f"the cameras came with the capture ({source})") for stage in stages]
-    settings = history.get("settings") or {}
-    if settings.get("strict"):
+    saw, how = True, "estimated from all photos (nerfcli poses without --strict)"
+    if (history.get("settings") or {}).get("strict"):
+        saw = False
         how = "estimated from training photos only; held-out photos were located afterwards with everything else fixed"
-        return [Entry(stage, False, how) for stage in stages]
-    how = "estimated from all photos (nerfcli poses without --strict)"
+        if holdout is not None:  # instead of the scene's split: perhaps others
+            saw, how = None, f"estimated without the photos that nerfcli poses held out, perhaps not those of {holdout}"
     given = "intrinsics" in history
     return [
-        Entry("poses", True, how),
-        Entry("intrinsics", False, "given and kept fixed") if given else Entry("intrinsics", True, how),
-        Entry("points", True, how),
+        Entry("poses", saw, how),
+        Entry("intrinsics", False, "given and kept fixed") if given else Entry("intrinsics", saw, how),
+        Entry("points", saw, how),
     ]
