@@ -201,7 +201,7 @@ def _describe_scene(report: PosesReport, scene_dir: Path, photos_dir: Path, *, g
         unit="arbitrary",
         masks=_masks_of(report, scene_dir),
         depths=depths_beside(photos_dir),
-        split=_split(report, report.settings.holdout),
+        split=_split(report),
     )
 
 
@@ -213,13 +213,13 @@ def _masks_of(report: PosesReport, scene_dir: Path) -> Path | None:
     return scene_dir / MASKS if found is not None and found["masked"] else None
 
 
-def _split(report: PosesReport, holdout: str) -> dict[str, str | None]:
+def _split(report: PosesReport) -> dict[str, str | None]:
     """Return which of the placed photos are for training and which for testing."""
     placed = [image.name for image in report.images if image.registered]
     if report.strict is not None:
         test = frozenset(report.strict["placed"])
-        return {name: "test" if name in test else "train" for name in placed}
-    test = names_held_out(holdout, placed, others=[image.name for image in report.images])
+    else:
+        test = names_held_out(report.settings.holdout, placed, others=[image.name for image in report.images])
     return {name: "test" if name in test else "train" for name in placed}
 
 

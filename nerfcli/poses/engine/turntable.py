@@ -7,7 +7,6 @@ The masks are in the scene's folder, named after the photos like those of `--mas
 Existing masks of an earlier call are used unchanged, since they may have been edited by hand.
 """
 
-import time
 from collections.abc import Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -135,7 +134,6 @@ def mask_turning_object(job: Job, tell: Tell) -> tuple[Job, dict[str, Any] | Non
     The job is unchanged if no masks can be accepted; the facts are None if there is nothing to report. Held-out photos
     get masks too, but only training photos decide whether and which. `tell` receives what was found.
     """
-    start = time.perf_counter()
     photos = _Photos(job)
     training = [number for number in range(len(job.files)) if number not in job.held_out]
     compared = _compare_photos(photos, training)
@@ -161,7 +159,6 @@ def mask_turning_object(job: Job, tell: Tell) -> tuple[Job, dict[str, Any] | Non
     facts["unmasked"] = [name for name, mask in zip(job.names, masks, strict=True) if mask is None]
     if facts["masked"]:
         job = replace(job, masks=_write_masks(job, masks, tell))
-    facts["seconds"] = round(time.perf_counter() - start, 3)
     write_stage(Path(job.folder) / _STAGE, _key(job), facts)
     return job, facts
 
