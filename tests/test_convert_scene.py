@@ -18,7 +18,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.conversion import ConventionOverrides, TargetOptions, convert, load
 from nerfcli.captures.formats import colmap_binary
-from nerfcli.captures.formats.colmap import write_colmap_binary
+from nerfcli.captures.formats.colmap import write_colmap_binary, write_colmap_text
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.registry import format_named
 from nerfcli.captures.formats.scene_folder import write_scene
@@ -338,6 +338,16 @@ def test_a_scene_is_replaced_only_with_overwrite_and_restored_after_a_fault(tmp_
     place = tmp_path / "scene"
     assert nerfcli("convert", place, place, "--to", "nerfcli", "--overwrite", *distance).exit_code == 0
     assert load_scene(place).unit == "metre"
+
+
+def test_a_text_model_in_the_place_of_a_scenes_model_is_kept(tmp_path):
+    """Regression: it was deleted without --overwrite, as its files have other names than those of a scene."""
+    write_colmap_text(photographed(capture_of([PINHOLE]), tmp_path / "images"), tmp_path / "sparse/0")
+    before = listing(tmp_path)
+    result = nerfcli("convert", tmp_path, tmp_path, "--to", "nerfcli")
+    assert result.exit_code == BAD_INPUT
+    assert "sparse/0/cameras.txt exists" in error_of(result)[0]
+    assert listing(tmp_path) == before
 
 
 # Intrinsics for another size

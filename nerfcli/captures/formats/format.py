@@ -44,7 +44,7 @@ class Format:
         open_axes: whether poses with other axes are found in such files, so that --axes makes sense.
         open_centre: whether principal points with other pixel centres are found in such files.
         default_name: the name of its file if the target is a folder; "" for formats that fill a folder.
-        files: the names of all files that it may write, where "*" stands for that file's name without its suffix.
+        files: the names of all files that it may write or replace; "*" stands for that file's name without its suffix.
         lacks: which of "cameras", "poses" and "points" it has no place for.
         is_unordered: whether the order of frames in its files means nothing, so that photos are sorted by name.
         has_split: whether its files say which photos are held out, for all photos.

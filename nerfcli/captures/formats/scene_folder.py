@@ -15,7 +15,7 @@ import numpy as np
 from nerfcli.atomic import write_json
 from nerfcli.cameras.frame import Frame, SensorDepth
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.colmap import parse_colmap, read_model, write_colmap_binary
+from nerfcli.captures.formats.colmap import MODEL_FILES, parse_colmap, read_model, write_colmap_binary
 from nerfcli.captures.formats.fields import read_json_object
 from nerfcli.captures.formats.format import Format, UserInputs, folder_with
 from nerfcli.captures.formats.photo_names import seen_from, with_photos
@@ -28,7 +28,6 @@ from nerfcli.version import __version__
 SCENE_FILE = "scene.json"
 MODEL_FOLDER = "sparse/0"
 POSES_REPORT = "poses_report.json"
-SCENE_FILES = (SCENE_FILE, *(f"{MODEL_FOLDER}/{name}.bin" for name in ("cameras", "images", "points3D")))
 SCENE_VERSION = 1
 UNITS = ("arbitrary", "metre")
 UNUSED = "unused"
@@ -354,7 +353,8 @@ FORMAT = Format(
     SCENE_FILE,
     folder_with(SCENE_FILE),
     parse_scene,
-    files=(*SCENE_FILES, POSES_REPORT),  # a report of other poses must not stay
+    # All files of a model, as its folder is replaced; and the report, as one of other poses must not stay.
+    files=(SCENE_FILE, *(f"{MODEL_FOLDER}/{name}" for name in MODEL_FILES), POSES_REPORT),
     is_unordered=True,
     has_split=True,
     write=write_scene,
