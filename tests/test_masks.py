@@ -11,7 +11,7 @@ from PIL import Image
 
 from nerfcli.errors import UserError
 from nerfcli.photos.images import read_image, write_png
-from nerfcli.photos.masks import find_mask, read_mask
+from nerfcli.photos.masks import find_mask, mask_of, read_mask
 from nerfcli.poses.engine.features import extract, feature_keys
 from nerfcli.poses.input.job import CameraGroup, Job, WorkMask, read_job, write_job
 from nerfcli.poses.input.layout import lay_out_masks
@@ -69,6 +69,23 @@ def test_a_mask_is_named_after_its_photo(masks, there, found):
     for name in there:
         (masks / name).touch()
     assert find_mask("a.b.jpg", masks) == (masks / found if found else None)
+
+
+@pytest.mark.parametrize(
+    ("name", "there", "found"),
+    [
+        ("images/left/a.jpg", ["images/left/a.png", "left/a.png", "a.png"], "images/left/a.png"),
+        ("images/left/a.jpg", ["left/a.png", "a.png"], "left/a.png"),
+        ("images/left/a.jpg", ["a.png", "right/a.png"], "a.png"),
+        ("../images/left/a.jpg", ["left/a.png"], "left/a.png"),
+        ("../images/left/a.jpg", ["right/a.png"], None),
+    ],
+)
+def test_a_mask_is_found_by_the_end_of_its_photos_path_and_is_never_the_photo(masks, name, there, found):
+    for path in ["../images/left/a.jpg", *there]:
+        (masks / path).parent.mkdir(parents=True, exist_ok=True)
+        (masks / path).touch()
+    assert mask_of(name, masks) == (masks / found if found else None)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

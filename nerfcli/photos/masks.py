@@ -49,8 +49,10 @@ def masks_inside(folder: Path, names: Sequence[str]) -> Path | None:
 
 
 def mask_of(name: str, masks: Path) -> Path | None:
-    """Find the mask of a photo as `find_mask`, or else by its file name alone."""
-    return find_mask(name, masks) or find_mask(Path(name).name, masks)
+    """Find the mask of a photo as `find_mask`, by the longest end of its path that has one; None if none has."""
+    parts = [part for part in name.split("/") if part != ".."]  # which would lead out of the folder, to the photo
+    found = (find_mask("/".join(parts[start:]), masks) for start in range(len(parts)))
+    return next(filter(None, found), None)
 
 
 def read_mask(path: Path, photo: Path) -> np.ndarray:

@@ -169,7 +169,7 @@ def depths_beside(photos: Path) -> dict[str, SensorDepth]:
 
 
 def with_masks(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with masks from a folder, by the names of the photos or by their file names alone.
+    """Return the capture with masks from a folder, by the names of the photos or by the ends of these.
 
     Photos without a mask there keep the one that they have.
 
