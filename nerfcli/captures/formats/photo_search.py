@@ -1,5 +1,6 @@
 """Look the names of a capture's photos up in the folders that may hold them; `photo_names` chooses one of these."""
 
+import itertools
 import os
 import re
 import unicodedata
@@ -19,6 +20,9 @@ OTHER_FOLDERS = ("input", "inputs", "image", "imgs", "photos", "rgb", "color", "
 # The end of the name of a folder that holds the photos of another one reduced by this factor.
 _REDUCED = re.compile(r"_(\d+)$", re.ASCII)
 
+
+# The parts of the paths of photos, by their stems and the names of their folders, in plain letters.
+Photos = dict[str, dict[str, list[tuple[str, ...]]]]
 
 _DRIVE = re.compile(r"[A-Za-z]:")
 _SUFFIX = re.compile(r"\.[A-Za-z]\w{1,4}$", re.ASCII)
@@ -77,9 +81,9 @@ class Place:
     def is_reduced(self) -> bool:
         return self.path != self.home and _REDUCED.search(self.path.name) is not None
 
-    def photos(self) -> dict[str, list[tuple[str, ...]]]:
-        """Return the parts of the photos' paths by their stems."""
-        found: dict[str, list[tuple[str, ...]]] = {}
+    def photos(self) -> Photos:
+        """Return the parts of the photos' paths by their stems and the names of their folders."""
+        found: Photos = {}
         for folder, subfolders, files in os.walk(self.path):
             parts = Path(folder).relative_to(self.path).parts
             if not parts and self.subfolders is not None:
@@ -88,7 +92,8 @@ class Place:
             for file in files:
                 stem, suffix = os.path.splitext(file)
                 if suffix.lower() in IMAGE_SUFFIXES and not file.startswith("."):
-                    found.setdefault(_plain(stem), []).append((*parts, file))
+                    of_stem = found.setdefault(_plain(stem), {})
+                    of_stem.setdefault(_plain(parts[-1]) if parts else "", []).append((*parts, file))
         return found
 
 
@@ -198,34 +203,36 @@ def search_of(place: Place, names: Sequence[Name], sizes: Sequence[Size | None] 
     return Search(place, paths, problems, unfit, (has_shape, len(found), not place.is_reduced, has_size, exact))
 
 
-def _matches(
-    name: Name, photos: dict[str, list[tuple[str, ...]]], place: Place, *, has_exact: bool
-) -> tuple[tuple[int, ...], list[Path]]:
+def _matches(name: Name, photos: Photos, place: Place, *, has_exact: bool) -> tuple[tuple[int, ...], list[Path]]:
     """Return the best score of photos for a name, and the photos that have it."""
+    by_folder = next((photos[stem] for stem in name.stems if stem in photos), {})
+    # The last folder decides first. With a folder for each photo, all photos may have the same name.
+    in_last = by_folder.get(name.folders[-1] if name.folders else "", [])
     scored: dict[tuple[int, ...], list[Path]] = {}
-    stem = next((stem for stem in name.stems if stem in photos), None)
-    for parts in photos[stem] if stem is not None else ():
-        folders = [_plain(part) for part in parts[:-1]]
-        common = 0
-        while common < min(len(folders), len(name.folders)) and folders[-1 - common] == name.folders[-1 - common]:
-            common += 1
-        left = name.folders[: len(name.folders) - common]
-        # A folder that the name lacks may be that of rejected photos, where others lie as they are listed.
-        if not name.is_absolute and len(folders) > common and (has_exact or not all(map(_is_image_folder, left))):
-            continue
-        path = place.path.joinpath(*parts)
-        suffix = path.suffix.lower()
-        file = name.plain.rpartition("/")[2]
-        score = (
-            common,
-            len(folders) == common,
-            suffix == name.suffix,
-            suffix not in HEIC_SUFFIXES,
-            file in (parts[-1], path.stem),
-        )
-        scored.setdefault(score, []).append(path)
+    for candidates in (in_last, itertools.chain.from_iterable(by_folder.values())):
+        for parts in candidates:
+            if (score := _score(name, parts, has_exact=has_exact)) is not None:
+                scored.setdefault(score, []).append(place.path.joinpath(*parts))
+        if scored:
+            break
     best = max(scored, default=())
     return best, scored.get(best, [])
+
+
+def _score(name: Name, parts: tuple[str, ...], *, has_exact: bool) -> tuple[int, ...] | None:
+    """Return how well the parts of a photo's path fit a name, to compare with others; None if they do not."""
+    folders = [_plain(part) for part in parts[:-1]]
+    common = 0
+    while common < min(len(folders), len(name.folders)) and folders[-1 - common] == name.folders[-1 - common]:
+        common += 1
+    left = name.folders[: len(name.folders) - common]
+    # A folder that the name lacks may be that of rejected photos, where others lie as they are listed.
+    if not name.is_absolute and len(folders) > common and (has_exact or not all(map(_is_image_folder, left))):
+        return None
+    file = PurePosixPath(parts[-1])
+    suffix, listed = file.suffix.lower(), name.plain.rpartition("/")[2]
+    is_listed = listed in (file.name, file.stem)
+    return common, len(folders) == common, suffix == name.suffix, suffix not in HEIC_SUFFIXES, is_listed
 
 
 def _is_image_folder(name: str) -> bool:
