@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
+from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.registry import FORMATS, recognise
 from nerfcli.captures.loading import describe_source, load_scene
 from nerfcli.errors import BAD_INPUT, UserError
@@ -64,6 +65,19 @@ def test_a_capture_without_photos_says_how_to_give_them(name, tmp_path):
     assert caught.value.exit_code == BAD_INPUT
     assert str(tmp_path) in caught.value.message
     assert "--images" in caught.value.hint or name in ("blender", "llff")
+
+
+@pytest.mark.parametrize("name", WITH_PHOTOS)
+def test_photos_in_another_folder_are_given(name, tmp_path):
+    file = WITH_PHOTOS[name](VIEWS, tmp_path / "capture")
+    (tmp_path / "elsewhere").mkdir()
+    for photo in [path for path in (tmp_path / "capture").rglob("*") if path.suffix in (".jpg", ".png")]:
+        if photo.parent.name != "mask":
+            photo.rename(tmp_path / "elsewhere" / photo.name)
+    form, found = recognise(file if name == "run" else tmp_path / "capture")
+    frames = form.parse(found, UserInputs(images=tmp_path / "elsewhere")).frames
+    assert len(frames) == len(POSES)
+    assert {frame.image.parent for frame in frames if frame.has_photo and frame.image} == {tmp_path / "elsewhere"}
 
 
 @pytest.mark.parametrize("name", WITHOUT_PHOTOS)

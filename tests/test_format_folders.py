@@ -73,16 +73,6 @@ def test_a_missing_photo_is_listed(tmp_path, name):
         np.testing.assert_allclose(capture.frames[0].world_from_cam, POSES[1], rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_photos_in_another_folder(tmp_path, name):
-    write(name, tmp_path / "capture")
-    home = next(iter((tmp_path / "capture").rglob("*.jpg")), tmp_path / "capture/image/000.png").parent
-    home.rename(tmp_path / "elsewhere")
-    _, capture = parse(tmp_path / "capture", UserInputs(images=tmp_path / "elsewhere"))
-    assert {frame.image.parent for frame in capture.frames if frame.image} == {tmp_path / "elsewhere"}
-    assert len(capture.frames) == len(POSES)
-
-
 OTHER_NAMES = [
     ("pose-files", "color", "images"),
     ("pose-files", "pose", "poses"),

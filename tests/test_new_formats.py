@@ -77,17 +77,6 @@ def test_files_of_windows_with_a_byte_order_mark_are_read(tmp_path, name):
     )
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_photos_in_another_folder(tmp_path, name):
-    WITH_PHOTOS[name](VIEWS, tmp_path / "capture")
-    (tmp_path / "elsewhere").mkdir()
-    for photo in [path for path in (tmp_path / "capture").rglob("*") if path.suffix in (".jpg", ".png")]:
-        photo.rename(tmp_path / "elsewhere" / photo.name)
-    frames = parse(tmp_path / "capture", UserInputs(images=tmp_path / "elsewhere")).frames
-    assert {frame.image.parent for frame in frames if frame.image} == {tmp_path / "elsewhere"}
-    assert all(frame.has_photo for frame in frames)
-
-
 def brown(k: tuple[float, float, float], p: tuple[float, float], x: float, y: float) -> tuple[float, float]:
     """OpenCV's polynomial of a point (x, y, 1), in units of the focal length."""
     r2 = x * x + y * y

@@ -12,8 +12,8 @@ from nerfcli.atomic import SEAL, read_sealed, write_sealed
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.format import Format
-from nerfcli.captures.formats.photo_names import seen_from
+from nerfcli.captures.formats.format import Format, UserInputs
+from nerfcli.captures.formats.photo_names import seen_from, with_photos
 from nerfcli.errors import UserError
 from nerfcli.photos.held_out_exposure import PhotoExposures
 
@@ -83,8 +83,10 @@ def find_run(path: Path) -> Path | None:
     return file if file.is_file() and (file.parent / "config.json").is_file() else None
 
 
-def parse_run(path: Path) -> Capture:
+def parse_run(path: Path, given: UserInputs = UserInputs()) -> Capture:
     """Return the frames of a RUN/cameras.json, training photos first; a run has no points.
+
+    Photos are where the run found them, unless the user gives their folder.
 
     Raises:
         UserError: see `read_cameras`.
@@ -92,7 +94,8 @@ def parse_run(path: Path) -> Capture:
     cameras = _read_frames(path, given=False)
     splits = (("train", cameras.train), ("test", cameras.test))
     frames = tuple(replace(frame, split=split) for split, frames in splits for frame in frames)
-    return Capture(frames, kind="run", pixels="upright")
+    capture = Capture(frames, kind="run", pixels="upright")
+    return capture if given.images is None else with_photos(capture, given=given.images)
 
 
 def _read_frames(path: Path, *, given: bool) -> RunCameras:
@@ -157,5 +160,5 @@ FORMAT = Format(
     "cameras refined by training",
     "cameras.json of a run",
     find_run,
-    lambda path, given: parse_run(path),
+    parse_run,
 )
