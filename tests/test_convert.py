@@ -163,6 +163,18 @@ def test_a_convention_that_the_format_fixes_is_refused(form, options, message, t
     assert not (tmp_path / "out").exists()
 
 
+def test_intrinsics_for_a_format_that_has_its_own_are_refused(tmp_path):
+    """They were ignored without a word."""
+    source = model_of(tmp_path, capture_of([PINHOLE]))
+    (tmp_path / "camera.json").write_text(json.dumps(SQUARE.to_json()))
+    options = ("--to", "transforms", "--intrinsics", tmp_path / "camera.json")
+    result = nerfcli("convert", source, tmp_path / "out.json", *options)
+    assert result.exit_code == USAGE
+    assert "colmap captures have their own cameras" in error_of(result)[0]
+    assert "tum, kitti" in error_of(result)[1]
+    assert not (tmp_path / "out.json").exists()
+
+
 def test_a_file_that_holds_the_inverse_is_read_so(tmp_path):
     capture = capture_of([PINHOLE])
     photograph(with_photos(capture, tmp_path).frames)

@@ -15,7 +15,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.captures.axes import Convention, expressed, opencv_from_axes, poses_of, reinterpreted
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.format import Format, UserInputs
-from nerfcli.captures.formats.registry import recognise, with_masks
+from nerfcli.captures.formats.registry import FORMATS, recognise, with_masks
 from nerfcli.captures.orientation import STORED, UPRIGHT, ReorientedCapture, in_pixels
 from nerfcli.errors import GATE_NOT_MET, UserError, several
 
@@ -139,9 +139,14 @@ def load(source: Path, given: UserInputs, overrides: ConventionOverrides) -> tup
         The format, the file or folder that was parsed, the capture.
 
     Raises:
-        UserError: there is no capture, it is damaged, or the given axes are invalid.
+        UserError: there is no capture, it is damaged, a camera is given that its format does not take, or the given
+            axes are invalid.
     """
     form, found = recognise(source)
+    if given.camera is not None and not form.takes_camera:
+        names = ", ".join(form.name for form in FORMATS if form.takes_camera)
+        hint = f"remove --intrinsics, which is for {names}"
+        raise UserError(f"{found}: {form.name} captures have their own cameras", hint, exit_code=2)
     capture = form.parse(found, given)
     if given.masks is not None:
         capture = with_masks(capture, given.masks)

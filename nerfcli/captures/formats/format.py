@@ -46,6 +46,7 @@ class Format:
         default_name: the name of its file if the target is a folder; "" for formats that fill a folder.
         files: the names of all files that it may write or replace; "*" stands for that file's name without its suffix.
         lacks: which of "cameras", "poses" and "points" it has no place for.
+        takes_camera: whether the user may give the camera of the frames.
         is_unordered: whether the order of frames in its files means nothing, so that photos are sorted by name.
         has_split: whether its files say which photos are held out, for all photos.
         unused_splits: splits whose photos are neither for training nor for evaluation.
@@ -65,6 +66,7 @@ class Format:
     default_name: str = ""
     files: tuple[str, ...] = ()
     lacks: tuple[str, ...] = ()
+    takes_camera: bool = False
     is_unordered: bool = False
     has_split: bool = False
     unused_splits: tuple[str, ...] = ()

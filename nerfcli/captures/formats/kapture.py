@@ -144,4 +144,5 @@ FORMAT = Format(
     "sensors/trajectories.txt",
     find_kapture,
     parse_kapture,
+    takes_camera=True,
 )

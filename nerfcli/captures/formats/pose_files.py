@@ -146,4 +146,5 @@ FORMAT = Format(
     "pose/*.txt",
     find_pose_files,
     parse_pose_files,
+    takes_camera=True,
 )

@@ -190,6 +190,7 @@ TUM = Format(
     default_name="trajectory.txt",
     files=("*.txt",),
     lacks=("cameras", "points"),
+    takes_camera=True,
     write=write_tum,
     losses=losses_tum,
 )
@@ -205,6 +206,7 @@ KITTI = Format(
     default_name="poses.txt",
     files=("*.txt",),
     lacks=("cameras", "points"),
+    takes_camera=True,
     write=write_kitti,
     losses=losses_kitti,
 )

@@ -107,4 +107,5 @@ FORMAT = Format(
     parse_tum_rgbd,
     open_axes=True,
     open_centre=True,
+    takes_camera=True,
 )
