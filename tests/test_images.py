@@ -283,14 +283,21 @@ def test_a_photo_with_any_byte_changed_is_read_or_refused(data, tmp_path_factory
             reader(path)
 
 
-def test_a_photo_of_200_megapixels_raises_no_alarm(tmp_path):
+@pytest.mark.parametrize(("width", "height", "is_read"), [(16_320, 12_240, True), (40_000, 20_000, False)])
+def test_a_photo_of_200_megapixels_raises_no_alarm_and_one_of_800_is_not_called_damaged(
+    tmp_path, width, height, is_read
+):
     """The header of a small PNG, rewritten: Pillow's own limit would call it an attack."""
     path = tmp_path / "large.png"
     write_png(path, noise(2, 2, 3))
     content = path.read_bytes()
-    header = b"IHDR" + struct.pack(">II", 16_320, 12_240) + content[24:29]
+    header = b"IHDR" + struct.pack(">II", width, height) + content[24:29]
     path.write_bytes(content[:12] + header + struct.pack(">I", zlib.crc32(header)) + content[33:])
-    assert image_size(path) == (16_320, 12_240)
+    if is_read:
+        assert image_size(path) == (width, height)
+    else:
+        with pytest.raises(UserError, match=r"large\.png has more than 536 megapixels"):
+            image_size(path)
 
 
 def test_list_images_is_sorted_and_takes_pictures_only(tmp_path):

@@ -35,8 +35,8 @@ IMAGE_SUFFIXES = _USUAL_SUFFIXES | UNUSUAL_SUFFIXES
 # Pillow now opens HEIC, too: upright, as the file itself says, and with an EXIF orientation of 1.
 pi_heif.register_heif_opener()
 
-# By default Pillow refuses more than 179 megapixels as an attack, but phones take photos of 200. The limit is now 537.
-Image.MAX_IMAGE_PIXELS = 2**28
+# Pillow refuses twice this as an attack: by default 179 megapixels, but phones take photos of 200. Now it is 536.
+_MOST_PIXELS = Image.MAX_IMAGE_PIXELS = 2**28
 
 _UPRIGHT_FROM_STORED = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -53,7 +53,7 @@ _DAMAGED = (
     *(struct.error, zlib.error, Image.DecompressionBombError),
 )
 _OR_REMOVE = "or remove it from the folder"
-_DAMAGED_HINT = "copy the photo again, or remove it from the folder"
+_DAMAGED_HINT = f"copy the photo again, {_OR_REMOVE}"
 _FORMATS = "JPEG, HEIC, AVIF, JPEG 2000, PNG, TIFF, WebP, BMP, GIF, TGA or PNM"
 _SRGB = ImageCms.createProfile("sRGB")
 # Two colour spaces that agree within this many of 255 levels on a grid of colours count as the same.
@@ -131,11 +131,7 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Rotate and mirror stored pixels according to an EXIF orientation (1...8).
-
-    Args:
-        pixels: uint8 (height, width), or with 3 or 4 channels.
-    """
+    """Rotate and mirror stored pixels, uint8 (H, W) or (H, W, 3 or 4), according to an EXIF orientation (1...8)."""
     _check_pixels(pixels)
     transpose = _UPRIGHT_FROM_STORED.get(orientation)
     return pixels if transpose is None else np.array(Image.fromarray(pixels).transpose(transpose))
@@ -223,23 +219,26 @@ def opened(path: Path) -> Iterator[Image.Image]:
                 if number_of_pages(image) > 1:
                     image.seek(_largest_page(image))
                 yield image
-    except UnidentifiedImageError as error:
-        if _has_float_samples(path):
-            raise UserError(f"{path} {_FLOAT}", _OR_REMOVE) from error
-        if path.suffix.lower() in HEIC_SUFFIXES and pi_heif.is_supported(path):  # it begins like one
-            raise UserError(f"{path} is damaged or truncated", _DAMAGED_HINT) from error
-        raise UserError(
-            f"{path} is not a readable picture",
-            f"supported are {_FORMATS}; convert it (raw files, too), or remove it from the folder",
-        ) from error
     except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
         if path.is_symlink() and not path.exists():
             raise UserError(f"{path} is a link to a file that does not exist", "copy the photo again") from error
         raise UserError(f"cannot read {path}: {error.strerror}", f"expected a {_FORMATS} file") from error
     except _DAMAGED as error:
-        if _has_float_samples(path):
-            raise UserError(f"{path} {_FLOAT}", _OR_REMOVE) from error
-        raise UserError(f"{path} is damaged or truncated: {error}", _DAMAGED_HINT) from error
+        raise _unusable(path, error) from error
+
+
+def _unusable(path: Path, error: Exception) -> UserError:
+    """Return the error for a file that Pillow cannot read."""
+    if isinstance(error, Image.DecompressionBombError):
+        return UserError(f"{path} has more than {2 * _MOST_PIXELS // 10**6} megapixels", f"reduce it, {_OR_REMOVE}")
+    if _has_float_samples(path):
+        return UserError(f"{path} {_FLOAT}", _OR_REMOVE)
+    if not isinstance(error, UnidentifiedImageError):
+        return UserError(f"{path} is damaged or truncated: {error}", _DAMAGED_HINT)
+    if path.suffix.lower() in HEIC_SUFFIXES and pi_heif.is_supported(path):  # it begins like one
+        return UserError(f"{path} is damaged or truncated", _DAMAGED_HINT)
+    hint = f"supported are {_FORMATS}; convert it (raw files, too), {_OR_REMOVE}"
+    return UserError(f"{path} is not a readable picture", hint)
 
 
 def number_of_pages(image: Image.Image) -> int:
