@@ -341,5 +341,17 @@ def test_a_photo_of_another_shape_is_reported(photographed):
         match_neighbours((other, *photographed.frames[1:]), progress=silent)
 
 
+def test_photos_in_formats_that_opencv_does_not_read_are_matched(photographed, tmp_path):
+    frames = []
+    for frame in photographed.frames[:3]:
+        assert frame.image is not None
+        path = tmp_path / f"{frame.image.stem}.tga"
+        Image.open(frame.image).save(path)
+        frames.append(replace(frame, image=path))
+    pairs, _ = match_neighbours(tuple(frames), progress=silent)
+    expected, _ = match_neighbours(photographed.frames[:3], progress=silent)
+    assert [pair.photos for pair in pairs] == [pair.photos for pair in expected]
+
+
 def test_a_principal_point_in_the_middle_was_not_given():
     assert for_picture(Camera.pinhole(640, 480, 500.0), 2.0) == Camera.pinhole(640, 480, 250.0)

@@ -18,7 +18,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.errors import UserError
 from nerfcli.matching.agreement import agreement, fundamental_matrix, rays_of
 from nerfcli.matching.features import Features, Matches, find_features, mutual_matches
-from nerfcli.photos.images import HEIC_SUFFIXES, read_image
+from nerfcli.photos.images import read_image
 
 # The longer side of the photos in which features are detected: a larger one finds better features, but takes longer.
 LONGER_SIDE_PX = 1000
@@ -92,20 +92,17 @@ def _photo(frame: Frame) -> tuple[Camera, Features]:
 
 def _stored_or_shown(camera: Camera, path: Path) -> tuple[np.ndarray, Camera]:
     """Return the grey photo, as stored or turned upright by its EXIF orientation, and the camera for its size."""
-    data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    error = UserError(f"{path} is not a readable picture", "replace it, or remove it from the folder")
-    for flag in (cv2.IMREAD_IGNORE_ORIENTATION, 0):
-        grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | flag) if len(data) else None
-        if grey is None:
-            continue
-        try:
-            return grey, camera.resized(grey.shape[1], grey.shape[0])
-        except UserError as mismatch:
-            error = UserError(f"{path}: {mismatch.message}", mismatch.hint)
-    if path.suffix.lower() in HEIC_SUFFIXES:  # which OpenCV does not read
+    data, grey = np.frombuffer(path.read_bytes(), dtype=np.uint8), None
+    for flag in (cv2.IMREAD_IGNORE_ORIENTATION, 0) if len(data) else ():
+        grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | flag)
+        if grey is not None and camera.has_shape(*grey.shape[::-1]):
+            break
+    if grey is None:  # OpenCV reads neither HEIC nor TGA; of a damaged file, the error of `read_image` says more
         grey = cv2.cvtColor(np.ascontiguousarray(read_image(path)[..., :3]), cv2.COLOR_RGB2GRAY)
-        return grey, camera.resized(grey.shape[1], grey.shape[0])
-    raise error
+    try:
+        return grey, camera.resized(*grey.shape[::-1])
+    except UserError as error:
+        raise UserError(f"{path}: {error.message}", error.hint) from error
 
 
 def _matched(first: tuple[Camera, Features], second: tuple[Camera, Features]) -> tuple[np.ndarray, np.ndarray] | None:
