@@ -314,7 +314,9 @@ def test_a_map_turns_like_its_photo_unless_it_is_upright(tmp_path, orientation, 
         (np.ones((20, 20)), "is 20x20, which is not the shape of its 300x200 photo"),
         (np.ones((2, 20, 30)), "is not a depth map: numbers of type float64 in shape"),
         (None, "does not exist"),
+        (np.ones((0, 0)), "is not a depth map: numbers of type float64 in shape"),
         (b"nothing", "is not a depth map: ValueError"),
+        (b"PK\x03\x04, as of an .npz file", "is not a depth map: ValueError"),
     ],
 )
 def test_what_is_no_map_of_the_photo_is_an_error(tmp_path, content, message):

@@ -17,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import OpenEXR
+from numpy.lib import format as npy_format
 
 from nerfcli.cameras.frame import SensorDepth
 from nerfcli.errors import UserError, reason_of
@@ -84,7 +85,8 @@ def _numbers(path: Path, aspect: float) -> np.ndarray:
     try:
         match path.suffix.lower():
             case ".npy":
-                found = np.load(path, allow_pickle=False)
+                with path.open("rb") as file:
+                    found = npy_format.read_array(file, allow_pickle=False)
             case ".exr":
                 channels = OpenEXR.File(str(path), separate_channels=True).channels()
                 found = np.asarray(channels.get("Z", next(iter(channels.values()))).pixels)
@@ -96,7 +98,7 @@ def _numbers(path: Path, aspect: float) -> np.ndarray:
     except (OSError, ValueError, RuntimeError, TypeError, EOFError, StopIteration) as error:
         raise UserError(f"{path} is not a depth map: {reason_of(error)}", _HINT) from error
     found = found.squeeze()
-    if found.ndim != 2 or found.dtype.kind not in "uif":
+    if found.ndim != 2 or not found.size or found.dtype.kind not in "uif":
         raise UserError(f"{path} is not a depth map: numbers of type {found.dtype} in shape {found.shape}", _HINT)
     return found
 
