@@ -5,15 +5,15 @@ scene.json states where the photos are, the split, masks, depth maps of a sensor
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from nerfcli.atomic import write_json
-from nerfcli.cameras.frame import Frame, SensorDepth
+from nerfcli.cameras.frame import SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import MODEL_FILES, parse_colmap, read_model, write_colmap_binary
 from nerfcli.captures.formats.fields import read_json_object
@@ -31,107 +31,6 @@ POSES_REPORT = "poses_report.json"
 SCENE_VERSION = 1
 UNITS = ("arbitrary", "metre")
 UNUSED = "unused"
-
-
-@dataclass(frozen=True)
-class Description:
-    """Content of a scene.json.
-
-    Args:
-        image_folder: folder of the photos, which the names of the model's images are relative to; need not exist.
-        model_dir: the COLMAP model, whose cameras refer to upright photos.
-        unit, unit_source: as in `Capture`.
-        listed: names of frames by their use: "test", "val", or "unused" for those that the split leaves out.
-        masks: the folder of the masks, or the mask of each photo that has one.
-        depths: the depth map of a sensor by the name of the frame.
-        depth_bounds: nearest and farthest z by the name of the frame, in scene units; empty where they are not known.
-        provenance: how the scene was made: command, settings, versions; empty if unknown.
-    """
-
-    path: Path
-    image_folder: Path
-    model_dir: Path
-    unit: str
-    unit_source: str | None
-    listed: Mapping[str, frozenset[str]]
-    masks: Path | Mapping[str, Path] | None
-    depths: Mapping[str, SensorDepth]
-    depth_bounds: Mapping[str, tuple[float, float]]
-    provenance: Mapping[str, Any]
-
-    def described(self, frames: Sequence[Frame]) -> tuple[Frame, ...]:
-        """Return the frames of the model with their masks, depths and splits; the split of unused frames is None."""
-        return tuple(
-            replace(f, mask=self._mask_of(f.name), depth=self.depths.get(f.name), split=self._split_of(f.name))
-            for f in frames
-        )
-
-    def bounds_of(self, frames: Sequence[Frame]) -> np.ndarray | None:
-        """Return the nearest and farthest z of frames, (frames, 2), if the file gives them for all of the frames."""
-        if not self.depth_bounds or not all(frame.name in self.depth_bounds for frame in frames):
-            return None
-        return np.array([self.depth_bounds[frame.name] for frame in frames]).reshape(-1, 2)
-
-    def _mask_of(self, name: str) -> Path | None:
-        if self.masks is None or isinstance(self.masks, Path):
-            return None if self.masks is None else find_mask(name, self.masks)
-        mask = self.masks.get(name)
-        if mask is not None and not mask.is_file():
-            raise UserError(
-                f"{self.path}: {mask}, the mask of {name}, does not exist", "restore it, or remove it from the file"
-            )
-        return mask
-
-    def _split_of(self, name: str) -> str | None:
-        part = next((part for part, names in self.listed.items() if name in names), "train")
-        return None if part == UNUSED else part
-
-
-def read_description(root: Path) -> Description:
-    """Read the scene.json of a folder, whether or not its photos exist.
-
-    Raises:
-        UserError: it is missing, of another version, or malformed; the key is named.
-    """
-    path = root / SCENE_FILE
-    content = read_json_object(path)
-    if content.get("measurement") == "transmission":
-        raise UserError(
-            f"{root} is an X-ray scan, not a scene of photos",
-            f"use nerfcli ct train {in_shell(root)}",
-        )
-    if content.get("version") != SCENE_VERSION:
-        raise UserError(
-            f"{path}: unknown version {content.get('version')!r}, expected {SCENE_VERSION}",
-            "update nerfcli, or estimate the poses again with nerfcli poses",
-        )
-
-    def place(text: str) -> Path:
-        return Path(os.path.normpath(root.resolve() / text))
-
-    image_folder = place(_text(content, "image_folder", path))
-    model_dir = root / _text(content, "model", path)
-    unit = _text(content, "unit", path)
-    if unit not in UNITS:
-        raise UserError(f"{path}: unit is {unit!r}", f"expected {' or '.join(UNITS)}")
-    source, masks = content.get("unit_source"), content.get("masks")
-    provenance = content.get("provenance")
-    if isinstance(masks, dict):
-        masks = {name: place(_text(masks, name, path)) for name in masks}
-    elif masks is not None:
-        masks = place(_text(content, "masks", path))
-    return Description(
-        path=path,
-        image_folder=image_folder,
-        model_dir=model_dir,
-        unit=unit,
-        unit_source=source if isinstance(source, str) else None,
-        listed=_listed_names(content, path),
-        masks=masks,
-        depths=_listed_depths(content, path, place),
-        depth_bounds=_listed_bounds(content, path),
-        provenance=provenance if isinstance(provenance, dict) else {},
-    )
 
 
 def save(
@@ -203,17 +102,35 @@ def _text(content: dict[str, Any], key: str, path: Path) -> str:
     return value
 
 
-def _listed_names(content: dict[str, Any], path: Path) -> dict[str, frozenset[str]]:
-    """Return the names under "test", "val" and "unused" of the split; only "test" is required."""
-    split = content.get("split")
-    names: dict[str, frozenset[str]] = {}
-    for part in ("test", "val", UNUSED):
-        listed = split.get(part, None if part == "test" else []) if isinstance(split, dict) else None
-        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+def _listed_splits(content: dict[str, Any], path: Path) -> dict[str, str | None]:
+    """Return the split of the frames that are not for training; None for those that the split leaves out."""
+    listed = content.get("split")
+    splits: dict[str, str | None] = {}
+    for part in (UNUSED, "val", "test"):
+        names = listed.get(part, None if part == "test" else []) if isinstance(listed, dict) else None
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             what = f"{path}: split.{part} is not a list of image names"
             raise UserError(what, 'expected "split": {"test": ["a.jpg", ...]}')
-        names[part] = frozenset(listed)
-    return names
+        splits |= dict.fromkeys(names, None if part == UNUSED else part)
+    return splits
+
+
+def _listed_masks(content: dict[str, Any], path: Path, place: Callable[[str], Path]) -> Path | dict[str, Path]:
+    """Return the folder of the masks, or the mask of each photo that has one."""
+    masks = content.get("masks")
+    if isinstance(masks, dict):
+        return {name: place(_text(masks, name, path)) for name in masks}
+    return {} if masks is None else place(_text(content, "masks", path))
+
+
+def _mask_of(name: str, masks: Path | Mapping[str, Path], path: Path) -> Path | None:
+    if isinstance(masks, Path):
+        return find_mask(name, masks)
+    mask = masks.get(name)
+    if mask is not None and not mask.is_file():
+        hint = "restore it, or remove it from the file"
+        raise UserError(f"{path}: {mask}, the mask of {name}, does not exist", hint)
+    return mask
 
 
 def _depth_entry(depth: SensorDepth, folder: Path) -> dict[str, Any]:
@@ -254,25 +171,51 @@ def _listed_bounds(content: dict[str, Any], path: Path) -> dict[str, tuple[float
     return bounds
 
 
-def parse_scene(path: Path, given: UserInputs = UserInputs()) -> Capture:
+def parse_scene(root: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the scene in a folder, with the photos of another folder if one is given.
 
     Raises:
-        UserError: scene.json or the model is damaged.
+        UserError: scene.json is missing, of another version, or malformed, and the key is named; or the model is
+            damaged.
     """
-    described = read_description(path)
-    capture = parse_colmap(described.model_dir, given.images or described.image_folder)
-    there = described.image_folder if described.image_folder.is_dir() else None
-    capture = with_photos(capture, path, given=given.images or there)
-    frames = described.described(capture.frames)
+    path = root / SCENE_FILE
+    content = read_json_object(path)
+    if content.get("measurement") == "transmission":
+        raise UserError(
+            f"{root} is an X-ray scan, not a scene of photos",
+            f"use nerfcli ct train {in_shell(root)}",
+        )
+    if content.get("version") != SCENE_VERSION:
+        raise UserError(
+            f"{path}: unknown version {content.get('version')!r}, expected {SCENE_VERSION}",
+            "update nerfcli, or estimate the poses again with nerfcli poses",
+        )
+
+    def place(text: str) -> Path:
+        return Path(os.path.normpath(root.resolve() / text))
+
+    image_folder, model, unit = (_text(content, key, path) for key in ("image_folder", "model", "unit"))
+    if unit not in UNITS:
+        raise UserError(f"{path}: unit is {unit!r}", f"expected {' or '.join(UNITS)}")
+    masks, splits = _listed_masks(content, path, place), _listed_splits(content, path)
+    depths, bounds = _listed_depths(content, path, place), _listed_bounds(content, path)
+    photos = place(image_folder)
+    capture = parse_colmap(root / model, given.images or photos)
+    capture = with_photos(capture, root, given=given.images or (photos if photos.is_dir() else None))
+    frames = tuple(
+        replace(f, mask=_mask_of(f.name, masks, path), depth=depths.get(f.name), split=splits.get(f.name, "train"))
+        for f in capture.frames
+    )
+    known = [bounds[frame.name] for frame in frames if frame.name in bounds]
+    source, provenance = content.get("unit_source"), content.get("provenance")
     return replace(
         capture,
         frames=frames,
-        unit=described.unit,
-        unit_source=described.unit_source,
-        depth_bounds=described.bounds_of(frames),
+        unit=unit,
+        unit_source=source if isinstance(source, str) else None,
+        depth_bounds=np.array(known) if len(known) == len(frames) else None,
         pixels=UPRIGHT,
-        provenance=described.provenance,
+        provenance=provenance if isinstance(provenance, dict) else {},
     )
 
 
