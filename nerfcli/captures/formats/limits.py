@@ -61,46 +61,27 @@ def _short(number: int) -> str:
     return str(number) if number < 10**12 else f"{float(number):.3g}" if number < 10**300 else "1e300 or more"
 
 
-def rigid_poses(matrices: np.ndarray, where: Callable[[int], str]) -> np.ndarray:
-    """Return poses (N, 4, 4) with rotations orthonormal to 1e-13, from (N, 3, 4) or (N, 4, 4) as a file holds them.
+def rigid_pose(matrix: np.ndarray, where: str) -> np.ndarray:
+    """Return a pose (4, 4) with a rotation orthonormal to 1e-13, from (3, 4) or (4, 4) as a file holds it.
 
     Args:
-        matrices: with a rotation in the upper left and a position in the fourth column; a fourth row is ignored.
-        where: returns the file and field of the matrix with a given index, to begin the message.
+        matrix: with a rotation in the upper left and a position in the fourth column; a fourth row is ignored.
+        where: the file and field of the matrix, to begin the message.
 
     Raises:
-        UserError: a matrix is not finite, mirrored, or farther from a rotation than rounding explains.
+        UserError: the matrix is not finite, mirrored, or farther from a rotation than rounding explains.
     """
-    rotations, positions = matrices[:, :3, :3], matrices[:, :3, 3]
-    _refuse(
-        ~plausible(matrices[:, :3].reshape(-1, 12)),
-        where,
-        what=f"contains a number that is not finite or above {MOST_UNITS:g}",
-        hint="the pose of this image is invalid; remove its entry",
-    )
-    bend = _bend(rotations)
-    _refuse(
-        bend > _MAX_DEVIATION,
-        where,
-        what="the upper left 3x3 block is not a rotation",
-        hint="rows must be orthogonal and of length 1",
-    )
-    _refuse(
-        np.linalg.det(rotations) < 0,
-        where,
-        what="mirrors the scene (determinant -1)",
-        hint="expected a right-handed camera frame",
-    )
-    bent = bend > _ROUNDING
-    if bent.any():
-        rotations = rotations.copy()
-        rotations[bent] = rigid.nearest_rotation(rotations[bent])
-    return rigid.from_parts(rotations, positions)
-
-
-def rigid_pose(matrix: np.ndarray, where: str) -> np.ndarray:
-    """Return `rigid_poses` of one matrix (3, 4) or (4, 4): a pose (4, 4)."""
-    return rigid_poses(matrix[None], lambda _: where)[0]
+    if not plausible(matrix[:3].ravel()):
+        what = f"contains a number that is not finite or above {MOST_UNITS:g}"
+        raise UserError(f"{where}: {what}", "the pose of this image is invalid; remove its entry")
+    rotation = matrix[:3, :3]
+    bend = _bend(rotation)
+    if bend > _MAX_DEVIATION:
+        what = "the upper left 3x3 block is not a rotation"
+        raise UserError(f"{where}: {what}", "rows must be orthogonal and of length 1")
+    if np.linalg.det(rotation) < 0:
+        raise UserError(f"{where}: mirrors the scene (determinant -1)", "expected a right-handed camera frame")
+    return rigid.from_parts(rigid.nearest_rotation(rotation) if bend > _ROUNDING else rotation, matrix[:3, 3])
 
 
 class NotFiniteError(UserError):
@@ -173,7 +154,7 @@ class FramePoses:
             found = matrix()
             if not np.isfinite(found[:3]).all():
                 raise NotFiniteError(f"{where}: contains a number that is not finite", "expected a pose")
-            if not plausible(found[:3].reshape(1, -1)).all():
+            if not plausible(found[:3].ravel()):
                 return found, 1.0  # for `rigid_pose` to refuse
             scale = float(np.sqrt((found[:3, :3] ** 2).sum() / 3))
             if scale < _LEAST_SCALE:
@@ -185,7 +166,7 @@ class FramePoses:
             return found, 1.0
         even = found.copy()
         even[:3, :3] /= scale
-        if _bend(even[None, :3, :3])[0] > _MAX_DEVIATION:
+        if _bend(even[:3, :3]) > _MAX_DEVIATION:
             return found, 1.0
         self._scales.append(scale)
         return even, scale
@@ -231,11 +212,6 @@ def quaternion_pose(xyzw: np.ndarray, position: np.ndarray, where: str) -> np.nd
     return rigid.from_parts(rigid.rotation_from_quaternion(xyzw[[3, 0, 1, 2]]), position)
 
 
-def _bend(rotations: np.ndarray) -> np.ndarray:
-    """Return by how much rotations (N, 3, 3) deviate from orthonormal."""
-    return np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(axis=(1, 2), initial=0)
-
-
-def _refuse(wrong: np.ndarray, where: Callable[[int], str], *, what: str, hint: str) -> None:
-    if wrong.any():
-        raise UserError(f"{where(int(np.argmax(wrong)))}: {what}", hint)
+def _bend(rotation: np.ndarray) -> float:
+    """Return by how much a rotation (3, 3) deviates from orthonormal."""
+    return float(np.abs(rotation @ rotation.T - np.eye(3)).max())
