@@ -11,6 +11,7 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import centres_of, focus_point, horizontal_axes, up_direction
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.captures.axes import poses_of
 from nerfcli.captures.boards import CharucoBoard, scale_from_charuco, scale_from_markers
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.orientation import measure_of, upright
@@ -34,12 +35,10 @@ def transformed(capture: Capture, new_from_world: Similarity) -> Capture:
     Poses and points are mapped, and depths along the cameras' axes are scaled. Pictures, observations and cameras do
     not change, since a similarity preserves angles. The unit is kept if the scale is 1, else it becomes "arbitrary".
     """
-    poses = new_from_world.apply_pose(np.stack([frame.world_from_cam for frame in capture.frames] or [np.eye(4)]))
-    bounds = capture.depth_bounds
+    poses, bounds = new_from_world.apply_pose(poses_of(capture)), capture.depth_bounds
     return replace(
         capture,
-        # Not strict: for a capture without frames there is one pose too many.
-        frames=tuple(replace(f, world_from_cam=pose) for f, pose in zip(capture.frames, poses, strict=False)),
+        frames=tuple(replace(f, world_from_cam=pose) for f, pose in zip(capture.frames, poses, strict=True)),
         points=new_from_world.apply(capture.points),
         depth_bounds=None if bounds is None else new_from_world.scale * bounds,
         unit=capture.unit if new_from_world.scale == 1 else "arbitrary",
@@ -47,29 +46,21 @@ def transformed(capture: Capture, new_from_world: Similarity) -> Capture:
     )
 
 
-def up_aligned(frames: Sequence[Frame], axis: str, *, up: np.ndarray | None = None) -> Similarity:
+def up_aligned(frames: Sequence[Frame], axis: str) -> Similarity:
     """Return the smallest rotation about the origin that turns the up direction onto an axis of the new frame.
 
     Args:
-        frames: give the up direction through `up_direction`, unless `up` is given.
+        frames: give the up direction through `up_direction`.
         axis: x, y, z, -x, -y or -z.
-        up: (3,) of any length, if it is known better (such as from gravity).
 
     Raises:
-        UserError: an unknown axis, an `up` of length 0, or neither frames nor `up`.
+        UserError: an unknown axis.
     """
     if axis not in WORLD_AXES:
         raise UserError(
             f"unknown axis {axis!r} for the up direction", f"choose one of {', '.join(WORLD_AXES)}", exit_code=2
         )
-    if up is None:
-        if not frames:
-            raise UserError("the capture has no cameras to estimate the up direction from", "give the up direction")
-        up = up_direction(frames)
-    length = float(np.linalg.norm(up))
-    if not (np.isfinite(length) and length > 0):
-        raise UserError(f"{up} is not a direction", "expected three finite numbers, not all 0")
-    return Similarity(1.0, smallest_rotation(np.asarray(up, dtype=np.float64) / length, WORLD_AXES[axis]), np.zeros(3))
+    return Similarity(1.0, smallest_rotation(up_direction(frames), WORLD_AXES[axis]), np.zeros(3))
 
 
 def moved_to_origin(frames: Sequence[Frame], origin: str) -> Similarity:
@@ -81,8 +72,6 @@ def moved_to_origin(frames: Sequence[Frame], origin: str) -> Similarity:
     """
     if origin not in ORIGINS:
         return Similarity(1.0, np.eye(3), -point_of(origin, f"choose {', '.join(ORIGINS)}, or x,y,z"))
-    if not frames:
-        raise UserError(f"the capture has no cameras to compute the {origin} from", "give the origin as x,y,z")
     place = centres_of(frames).mean(axis=0) if origin == ORIGINS[0] else focus_point(frames)
     return Similarity(1.0, np.eye(3), -place)
 
