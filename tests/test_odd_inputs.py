@@ -321,6 +321,15 @@ def test_a_frame_without_a_pose_is_left_out_and_named(form, tmp_path):
     assert "2" in capture.notes[0].split(" left out: ")[1].split(" (")[0]
 
 
+def test_a_capture_whose_only_photo_has_no_pose_is_refused(tmp_path):
+    lose_record3d(put("record3d", tmp_path))
+    for photo in tmp_path.rglob("*.jpg"):
+        if photo.stem != str(LOST):
+            photo.unlink()
+    with pytest.raises(UserError, match="lists no images with a pose"):
+        parsed(tmp_path)
+
+
 @pytest.mark.parametrize("form", ["mvsnet", "polycam", "pose-files"])
 @pytest.mark.parametrize("count", [5, 7])
 def test_too_few_poses_are_refused_with_the_reason(form, count, tmp_path):

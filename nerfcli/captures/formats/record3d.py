@@ -16,7 +16,15 @@ import numpy as np
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.frame import Frame, SensorDepth
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import malformed, number, read_json_object, shown, size_of, vector
+from nerfcli.captures.formats.fields import (
+    check_unique_names,
+    malformed,
+    number,
+    read_json_object,
+    shown,
+    size_of,
+    vector,
+)
 from nerfcli.captures.formats.format import Format, UserInputs, has_keys, named
 from nerfcli.captures.formats.limits import FramePoses, checked_camera
 from nerfcli.captures.formats.photo_names import find_photos
@@ -54,6 +62,7 @@ def parse_record3d(path: Path, given: UserInputs = UserInputs()) -> Capture:
             maps = (path.parent / "depth" / f"{index}.exr", image.with_suffix(".exr"), image.with_suffix(".depth"))
             depth = SensorDepth.found(*maps, confidence=image.with_suffix(".conf"))
             frames.append(Frame(image.name, camera, pose, image=image, depth=depth))
+    check_unique_names((frame.name for frame in frames), path)
     notes, source = (*photos.notes, *usable.notes()), "ARKit (Record3D)"
     return Capture(
         tuple(frames), missing=photos.missing, kind="record3d", unit="metre", unit_source=source, notes=notes
