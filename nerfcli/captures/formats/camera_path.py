@@ -26,16 +26,13 @@ import numpy as np
 from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose, opengl_from_opencv_pose
-from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.frame import Frame, Size
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import read_json_object
+from nerfcli.captures.formats.fields import number, read_json_object, record_of, size_of, vector
 from nerfcli.captures.formats.format import Format, find_json, has_keys
 from nerfcli.captures.formats.limits import rigid_pose
 from nerfcli.captures.formats.unsupported import distortion, projection
 from nerfcli.errors import UserError
-
-# A larger width or height is taken for a damaged number.
-_MOST_PIXELS = 65536
 
 DEFAULT_FPS = 24.0
 
@@ -65,7 +62,8 @@ def read_path(path: Path) -> CameraPath:
     kind = content.get("camera_type", "perspective")
     if not isinstance(kind, str) or kind.lower() not in _MODELS:
         raise UserError(f"{path}: camera_type is {kind!r}", f"expected {', '.join(_MODELS)}")
-    width, height = (_pixels(content, key, path) for key in ("render_width", "render_height"))
+    width, height = (number(content, key, str(path)) for key in ("render_width", "render_height"))
+    size = size_of(width, height, str(path))
     records = content.get("camera_path")
     if not isinstance(records, list) or not records:
         raise UserError(
@@ -75,10 +73,8 @@ def read_path(path: Path) -> CameraPath:
     frames = []
     for index, record in enumerate(records):
         where = f"{path}: camera_path[{index}]"
-        if not isinstance(record, dict):
-            raise UserError(f"{where} is {_short(record)}", 'expected {"camera_to_world": 16 numbers, "fov": degrees}')
-        camera = _camera(record, kind.lower(), width, height, where=where)
-        frames.append(Frame(f"frame_{index:04d}", camera, _pose(record, where)))
+        view = record_of(record, where)
+        frames.append(Frame(f"frame_{index:04d}", _camera(view, kind.lower(), size, where), _pose(view, where)))
     return CameraPath(tuple(frames), _fps(content, len(frames), path))
 
 
@@ -88,7 +84,7 @@ def parse_camera_path(path: Path) -> Capture:
 
 
 def losses_camera_path(capture: Capture) -> tuple[str, ...]:
-    """List the parts of a capture that a camera path cannot hold, one clause each."""
+    """List the properties of a capture's cameras that a camera path cannot hold, one clause each."""
     frames = capture.frames
     kept = _common_cameras(frames)
     counts = {
@@ -97,22 +93,8 @@ def losses_camera_path(capture: Capture) -> tuple[str, ...]:
         "principal point": sum(f.camera != f.camera.centred() for f in frames),
         "focal lengths that differ in x and y": sum(len(set(f.camera.focal_lengths)) > 1 for f in frames),
         "picture size": sum(f.camera.size != k.size for f, k in zip(frames, kept, strict=True)),
-        "photo": sum(f.image is not None for f in frames),
-        "mask": sum(f.mask is not None for f in frames),
-        "split": sum(f.split is not None for f in frames),
     }
-    clauses = [f"{name} of {count} of {len(frames)} views" for name, count in counts.items() if count]
-    if len(capture.points):
-        clauses.append(f"{len(capture.points)} points")
-    if capture.colours is not None:
-        clauses.append(f"colours of {len(capture.colours)} points")
-    if capture.observations is not None:
-        clauses.append("observations")
-    if capture.depth_bounds is not None:
-        clauses.append("depth bounds")
-    if capture.unit != "arbitrary":
-        clauses.append(f"the unit ({capture.unit})")
-    return tuple(clauses)
+    return tuple(f"{name} of {count} of {len(frames)} views" for name, count in counts.items() if count)
 
 
 def write_camera_path(capture: Capture, path: Path, *, fps: float = DEFAULT_FPS) -> None:
@@ -147,10 +129,11 @@ def write_camera_path(capture: Capture, path: Path, *, fps: float = DEFAULT_FPS)
     write_json(path, content)
 
 
-def _camera(record: dict[str, Any], kind: str, width: int, height: int, *, where: str) -> Camera:
+def _camera(view: dict[str, Any], kind: str, size: Size, where: str) -> Camera:
+    width, height = size
     if kind == "equirectangular":
         return Camera("EQUIRECTANGULAR", width, height, (width, height))
-    fov = _number(record, "fov", where)
+    fov = number(view, "fov", where)
     if not 0 < fov < 180:
         raise UserError(f"{where}: fov is {fov}", "expected the vertical field of view in degrees, between 0 and 180")
     focal = height / 2 / math.tan(math.radians(fov) / 2)
@@ -158,43 +141,19 @@ def _camera(record: dict[str, Any], kind: str, width: int, height: int, *, where
     return pinhole if kind == "perspective" else Camera("OPENCV_FISHEYE", width, height, (*pinhole.params, 0, 0, 0, 0))
 
 
-def _pose(record: dict[str, Any], where: str) -> np.ndarray:
+def _pose(view: dict[str, Any], where: str) -> np.ndarray:
     """Return `world_from_cam` (4, 4), OpenCV axes, exactly rigid."""
-    where = f"{where}.camera_to_world"
-    values = record.get("camera_to_world")
-    if isinstance(values, list) and len(values) in (3, 4) and all(isinstance(row, list) for row in values):
+    key = "camera_to_world"
+    values = view.get(key)
+    if isinstance(values, list) and all(isinstance(row, list) for row in values):
         values = [value for row in values for value in row]
-    if not isinstance(values, list):
-        raise UserError(f"{where} is {_short(values)}", "expected 16 numbers, row by row")
-    matrix = _matrix(values, 4, where)
+    matrix = vector({key: values}, key, 16, where).reshape(4, 4)
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise UserError(
-            f"{where}: the last row is {', '.join(f'{v:.4g}' for v in matrix[3])}",
+            f"{where}.{key}: the last row is {', '.join(f'{v:.4g}' for v in matrix[3])}",
             "expected 0, 0, 0, 1: the matrix is stored row by row, with the position in the last column",
         )
-    return opencv_from_opengl_pose(rigid_pose(matrix, where))
-
-
-def _matrix(values: list[Any], rows: int, where: str) -> np.ndarray:
-    """Return a matrix (rows, 4) from a flat list."""
-    if len(values) != 4 * rows:
-        raise UserError(f"{where} has {len(values)} numbers", f"expected {4 * rows} numbers, row by row")
-    numbers = [_number({f"[{i}]": value}, f"[{i}]", where) for i, value in enumerate(values)]
-    return np.array(numbers).reshape(rows, 4)
-
-
-def _number(record: dict[str, Any], key: str, where: str) -> float:
-    value = record.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e100:
-        raise UserError(f"{where}: {key} is {_short(value)}", "expected a finite number")
-    return float(value)
-
-
-def _pixels(content: dict[str, Any], key: str, path: Path) -> int:
-    value = _number(content, key, str(path))
-    if not 1 <= value <= _MOST_PIXELS or value != int(value):
-        raise UserError(f"{path}: {key} is {value:g}", f"expected an integer from 1 to {_MOST_PIXELS}")
-    return int(value)
+    return opencv_from_opengl_pose(rigid_pose(matrix, f"{where}.{key}"))
 
 
 def _fps(content: dict[str, Any], count: int, path: Path) -> float:
@@ -202,16 +161,11 @@ def _fps(content: dict[str, Any], count: int, path: Path) -> float:
     for key in ("fps", "seconds"):
         if content.get(key) is None:
             continue
-        value = _number(content, key, str(path))
+        value = number(content, key, str(path))
         if not value > 0:
             raise UserError(f"{path}: {key} is {value:g}", "expected a number above 0")
         return value if key == "fps" else count / value
     return DEFAULT_FPS
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _common_cameras(frames: Sequence[Frame]) -> tuple[Camera, ...]:
