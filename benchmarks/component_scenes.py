@@ -22,9 +22,9 @@ import typer
 from PIL import ExifTags, Image
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
+from nerfcli.captures.axes import opencv_pose
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import scene_folder
 from nerfcli.captures.formats.colmap import write_colmap_binary
@@ -185,7 +185,7 @@ def ball_pose(index: int, count: int) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3] = np.stack((right, np.cross(backward, right), backward), axis=1)
     pose[:3, 3] = REACH * backward
-    return opencv_from_opengl_pose(pose)
+    return opencv_pose(pose, "opengl")
 
 
 def ball_camera() -> Camera:

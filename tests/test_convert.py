@@ -13,8 +13,7 @@ from views import BROWN, FISHEYE, PANORAMA, PINHOLE, PRISM, RADIAL, RATIONAL, SQ
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.conventions import OPENCV_FROM_LLFF, OPENCV_FROM_OPENGL
-from nerfcli.captures.axes import Convention, all_axes, expressed, opencv_from_axes, reinterpreted
+from nerfcli.captures.axes import Convention, all_axes, expressed, opencv_from_axes, pose_in_axes, reinterpreted
 from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.conversion import ConventionOverrides, TargetOptions, convert, load
 from nerfcli.captures.formats import blender, llff, transforms, transforms_cameras
@@ -53,8 +52,9 @@ def farthest_px(a: Capture, b: Capture) -> float:
 
 def test_named_axes_are_those_of_the_other_programs():
     np.testing.assert_array_equal(opencv_from_axes("opencv"), np.eye(4))
-    np.testing.assert_array_equal(opencv_from_axes("opengl"), OPENCV_FROM_OPENGL)
-    np.testing.assert_array_equal(opencv_from_axes("llff"), OPENCV_FROM_LLFF)
+    # OpenGL: x right, y up, z backward. LLFF: x down, y right, z backward.
+    np.testing.assert_array_equal(opencv_from_axes("opengl"), np.diag([1.0, -1.0, -1.0, 1.0]))
+    np.testing.assert_array_equal(opencv_from_axes("llff")[:3, :3], [[0, 1, 0], [1, 0, 0], [0, 0, -1]])
     # PyTorch3D: x left, y up, z forward. ROS: x forward is OpenCV's z, y left is -x, z up is -y.
     np.testing.assert_array_equal(opencv_from_axes("pytorch3d"), np.diag([-1.0, -1.0, 1.0, 1.0]))
     np.testing.assert_array_equal(opencv_from_axes("ros")[:3, :3], [[0, -1, 0], [0, 0, -1], [1, 0, 0]])
@@ -292,14 +292,8 @@ def half_a_pixel(camera: Camera) -> dict[str, Any]:
 
 FAULTS = {
     "half a pixel": ("transforms", transforms, "record_of_camera", half_a_pixel, "a ray is off by 0.707 px"),
-    "flipped axes": ("blender", blender, "opengl_from_opencv_pose", lambda pose: pose, "a ray is off by"),
-    "axes of OpenGL": (
-        "llff",
-        llff,
-        "llff_from_opencv_pose",
-        lambda pose: pose @ OPENCV_FROM_OPENGL,
-        "a ray is off by",
-    ),
+    "flipped axes": ("blender", blender, "pose_in_axes", lambda pose, axes: pose, "a ray is off by"),
+    "axes of OpenGL": ("llff", llff, "pose_in_axes", lambda pose, _: pose_in_axes(pose, "opengl"), "a ray is off by"),
     "moved points": (
         *("transforms", transforms, "write_points"),
         *(

@@ -11,12 +11,7 @@ from PIL import Image
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.conventions import (
-    llff_from_opencv_pose,
-    opencv_from_llff_pose,
-    opencv_from_opengl_pose,
-    opengl_from_opencv_pose,
-)
+from nerfcli.captures.axes import opencv_pose, pose_in_axes
 from nerfcli.captures.formats.colmap import is_model, read_model
 from nerfcli.captures.formats.transforms import parse_transforms
 from nerfcli.captures.loading import load_scene
@@ -51,10 +46,9 @@ def entry(file_path: str, **more: Any) -> dict[str, Any]:
 
 
 def test_axes_of_other_programs_by_hand():
-    np.testing.assert_array_equal(opencv_from_opengl_pose(np.array(OPENGL_POSE)), OPENCV_POSE)
-    np.testing.assert_array_equal(opengl_from_opencv_pose(np.array(OPENCV_POSE)), OPENGL_POSE)
-    np.testing.assert_array_equal(opencv_from_llff_pose(np.array(LLFF_POSE)), OPENCV_POSE)
-    np.testing.assert_array_equal(llff_from_opencv_pose(np.array(OPENCV_POSE)), LLFF_POSE)
+    for axes, pose in (("opengl", OPENGL_POSE), ("llff", LLFF_POSE)):
+        np.testing.assert_array_equal(opencv_pose(np.array(pose), axes), OPENCV_POSE)
+        np.testing.assert_array_equal(pose_in_axes(np.array(OPENCV_POSE), axes), pose)
 
 
 def test_instant_ngp_file_with_shared_intrinsics_and_missing_images(tmp_path):
@@ -109,7 +103,7 @@ def test_rounded_poses_become_exactly_rigid(tmp_path):
     path = write_capture(tmp_path, {**SHARED, "frames": [{"file_path": "a", "transform_matrix": rounded[:3].tolist()}]})
     pose = load_scene(path).frames[0].world_from_cam
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(opengl_from_opencv_pose(pose), rounded, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(pose_in_axes(pose, "opengl"), rounded, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize(

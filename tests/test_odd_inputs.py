@@ -24,7 +24,7 @@ from PIL import Image
 from views import PINHOLE, capture_of
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.conventions import opengl_from_opencv_pose
+from nerfcli.captures.axes import pose_in_axes
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import write_colmap_binary, write_colmap_text
 from nerfcli.captures.formats.format import UserInputs
@@ -58,7 +58,7 @@ def colmap(folder: Path, names: Sequence[str]) -> None:
 def transforms_record(names: Sequence[str], **more: Any) -> dict[str, Any]:
     fx, fy, cx, cy = PINHOLE.params
     head = {"w": SIZE[0], "h": SIZE[1], "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
-    matrices = [opengl_from_opencv_pose(frame.world_from_cam).tolist() for frame in CAPTURE.frames]
+    matrices = [pose_in_axes(frame.world_from_cam, "opengl").tolist() for frame in CAPTURE.frames]
     frames = [{"file_path": n, "transform_matrix": m} for n, m in zip(names, matrices, strict=False)]
     return {**head, "frames": frames, **more}
 

@@ -16,8 +16,9 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import UserError
 
-# Sources: docs.opencv.org calib3d; docs.nerf.studio "Data conventions"; Fyusion/LLFF README;
-# pytorch3d.org/docs/cameras; ROS REP 103, body frames.
+# Sources: docs.opencv.org calib3d; docs.nerf.studio "Data conventions", also for Blender, NeRF and instant-ngp
+# (docs/nerf_dataset_tips.md); Fyusion/LLFF README, "Using your own poses without running COLMAP": "[-y, x, z]" of the
+# NeRF axes; pytorch3d.org/docs/cameras; ROS REP 103, body frames.
 NAMED_AXES = {"opencv": "rdf", "opengl": "rub", "llff": "drb", "pytorch3d": "luf", "ros": "flu"}
 
 _DIRECTIONS = {"r": (1, 0, 0), "l": (-1, 0, 0), "d": (0, 1, 0), "u": (0, -1, 0), "f": (0, 0, 1), "b": (0, 0, -1)}
@@ -45,6 +46,16 @@ def opencv_from_axes(axes: str) -> np.ndarray:
     turn = rigid.from_parts(columns, np.zeros(3))
     turn.flags.writeable = False
     return turn
+
+
+def opencv_pose(world_from_file_cam: np.ndarray, axes: str) -> np.ndarray:
+    """Return `world_from_cam` (..., 4, 4) with OpenCV axes, given a pose with these; the world stays the same."""
+    return world_from_file_cam @ rigid.inverse(opencv_from_axes(axes))
+
+
+def pose_in_axes(world_from_cam: np.ndarray, axes: str) -> np.ndarray:
+    """Return a pose (..., 4, 4) with these camera axes, given `world_from_cam` with OpenCV axes."""
+    return world_from_cam @ opencv_from_axes(axes)
 
 
 def all_axes() -> Iterator[str]:
@@ -107,10 +118,8 @@ def expressed(capture: Capture, wanted: Convention, *, written_axes: str) -> Cap
 
 def reinterpreted_poses(world_from_cam: np.ndarray, true_convention: Convention, *, parsed_axes: str) -> np.ndarray:
     """Return the poses (frames, 4, 4), OpenCV axes, of a file in another convention than the one it was parsed in."""
-    in_file = world_from_cam @ opencv_from_axes(parsed_axes)
-    if true_convention.inverted:
-        in_file = rigid.inverse(in_file)
-    return in_file @ rigid.inverse(opencv_from_axes(true_convention.axes))
+    in_file = pose_in_axes(world_from_cam, parsed_axes)
+    return opencv_pose(rigid.inverse(in_file) if true_convention.inverted else in_file, true_convention.axes)
 
 
 def poses_of(capture: Capture) -> np.ndarray:

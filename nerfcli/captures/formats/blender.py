@@ -12,8 +12,8 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from nerfcli.atomic import write_json
-from nerfcli.cameras.conventions import opengl_from_opencv_pose
 from nerfcli.cameras.frame import Frame
+from nerfcli.captures.axes import pose_in_axes
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, read_json_object
 from nerfcli.captures.formats.format import Format, UserInputs
@@ -90,7 +90,7 @@ def write_blender(capture: Capture, folder: Path) -> None:
             records = [
                 {
                     "file_path": _file_path(frame, folder),
-                    "transform_matrix": opengl_from_opencv_pose(frame.world_from_cam).tolist(),
+                    "transform_matrix": pose_in_axes(frame.world_from_cam, "opengl").tolist(),
                 }
                 for frame in frames
             ]

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.frame import Frame
+from nerfcli.captures.axes import opencv_pose
 from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, name_of, numbers, read_text
@@ -66,7 +66,7 @@ def parse_bundler(path: Path, given: UserInputs = UserInputs()) -> Capture:
             size = stored_size(image)
             index_of_camera[index] = len(frames)
             camera = _camera(own, size, path)
-            frames.append(Frame(name, camera, opencv_from_opengl_pose(pose), image=image))
+            frames.append(Frame(name, camera, opencv_pose(pose, "opengl"), image=image))
             middles.append((size[0] / 2, size[1] / 2))
     points, colours, views = _points(lines[1 + 5 * num_cameras :], num_cameras, num_points, path)
     seen = _observations(views, index_of_camera, np.array(middles))

@@ -25,8 +25,8 @@ import numpy as np
 
 from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.conventions import opencv_from_opengl_pose, opengl_from_opencv_pose
 from nerfcli.cameras.frame import Frame, Size
+from nerfcli.captures.axes import opencv_pose, pose_in_axes
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import number, read_json_object, record_of, size_of, vector
 from nerfcli.captures.formats.format import Format, find_json, has_keys
@@ -111,7 +111,7 @@ def write_camera_path(capture: Capture, path: Path, *, fps: float = DEFAULT_FPS)
     width, height = cameras[0].size
     records = []
     for frame, camera in zip(capture.frames, cameras, strict=True):
-        pose = opengl_from_opencv_pose(frame.world_from_cam).ravel().tolist()
+        pose = pose_in_axes(frame.world_from_cam, "opengl").ravel().tolist()
         fov = 90.0 if camera.is_spherical else math.degrees(2 * math.atan2(height / 2, camera.focal_px))
         records.append({"camera_to_world": pose, "fov": fov, "aspect": width / height})
     content = {
@@ -153,7 +153,7 @@ def _pose(view: dict[str, Any], where: str) -> np.ndarray:
             f"{where}.{key}: the last row is {', '.join(f'{v:.4g}' for v in matrix[3])}",
             "expected 0, 0, 0, 1: the matrix is stored row by row, with the position in the last column",
         )
-    return opencv_from_opengl_pose(rigid_pose(matrix, f"{where}.{key}"))
+    return opencv_pose(rigid_pose(matrix, f"{where}.{key}"), "opengl")
 
 
 def _fps(content: dict[str, Any], count: int, path: Path) -> float:

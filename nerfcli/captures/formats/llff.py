@@ -15,8 +15,8 @@ import numpy as np
 from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
 from nerfcli.cameras.frame import Frame
+from nerfcli.captures.axes import opencv_pose, pose_in_axes
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import DAMAGED, array_of_npy
 from nerfcli.captures.formats.format import Format, UserInputs, folder_with
@@ -60,7 +60,7 @@ def parse_llff(folder: Path, given: UserInputs = UserInputs()) -> Capture:
     kept = [index for index, pose in enumerate(views) if pose is not None]
     cameras = _cameras(path, rows, kept)
     frames = [
-        Frame(names[index], camera, opencv_from_llff_pose(pose), image=photos[index])
+        Frame(names[index], camera, opencv_pose(pose, "llff"), image=photos[index])
         for index, camera in zip(kept, cameras, strict=True)
         if (pose := views[index]) is not None
     ]
@@ -91,7 +91,7 @@ def write_llff(capture: Capture, folder: Path) -> None:
     """
     refuse_spherical(capture, "focal length")
     bounds = _percentile_bounds(capture) if capture.depth_bounds is None else capture.depth_bounds
-    poses = llff_from_opencv_pose(np.array([frame.world_from_cam for frame in capture.frames]))
+    poses = pose_in_axes(np.array([frame.world_from_cam for frame in capture.frames]), "llff")
     sizes = [(frame.camera.height, frame.camera.width, frame.camera.focal_lengths[0]) for frame in capture.frames]
     matrices = np.concatenate([poses[:, :3], np.array(sizes, dtype=np.float64)[:, :, None]], axis=2)  # (F, 3, 5)
     rows = np.concatenate([matrices.reshape(-1, 15), bounds], axis=1)

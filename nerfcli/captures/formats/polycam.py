@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
+from nerfcli.captures.axes import opencv_pose
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, number, read_json_object, size_of
 from nerfcli.captures.formats.format import Format, UserInputs
@@ -57,7 +57,7 @@ def parse_polycam(folder: Path, given: UserInputs = UserInputs()) -> Capture:
         if image is not None and pose is not None:
             depth, confidence = (found[0].parent / kind / f"{stem}.png" for kind in ("depth", "confidence"))
             measured = SensorDepth.found(depth, unit=MILLIMETRE, confidence=confidence)
-            frames.append(Frame(image.name, camera, opencv_from_opengl_pose(pose), image=image, depth=measured))
+            frames.append(Frame(image.name, camera, opencv_pose(pose, "opengl"), image=image, depth=measured))
     whole = len(list((folder / KEYFRAMES / "cameras").glob("*.json")))
     left = (f"{whole - len(stems)} of {whole} keyframes left out, whose poses Polycam has not corrected",)
     notes = (*photos.notes, *poses.notes(), *(left if whole > len(stems) else ()))

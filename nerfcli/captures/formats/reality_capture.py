@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.frame import Frame
+from nerfcli.captures.axes import opencv_pose
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import (
     check_unique_names,
@@ -69,7 +69,7 @@ def parse_reality_capture(path: Path, given: UserInputs = UserInputs()) -> Captu
     value = {key: rows[:, index] for index, key in enumerate(_NUMBERS)}
     angles = np.stack([-value["heading"], value["pitch"], value["roll"]], axis=-1)
     rotations = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
-    poses = opencv_from_opengl_pose(rigid.from_parts(rotations, rows[:, :3]))
+    poses = opencv_pose(rigid.from_parts(rotations, rows[:, :3]), "opengl")
     fits, frames = Fits(), []
     for index, (name, image) in enumerate(zip(found.names, found.paths, strict=True)):
         if image is not None:

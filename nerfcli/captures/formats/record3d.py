@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.frame import Frame, SensorDepth
+from nerfcli.captures.axes import opencv_pose
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import (
     check_unique_names,
@@ -58,7 +58,7 @@ def parse_record3d(path: Path, given: UserInputs = UserInputs()) -> Capture:
         world_from_cam = usable.read_quaternion(str(index), place, partial(vector, {"pose": pose}, "pose", 7, place))
         if image is not None and world_from_cam is not None:
             camera = checked_camera("PINHOLE", *size, tuple(intrinsics[index]), where=where)
-            pose = opencv_from_opengl_pose(world_from_cam)
+            pose = opencv_pose(world_from_cam, "opengl")
             maps = (path.parent / "depth" / f"{index}.exr", image.with_suffix(".exr"), image.with_suffix(".depth"))
             depth = SensorDepth.found(*maps, confidence=image.with_suffix(".conf"))
             frames.append(Frame(image.name, camera, pose, image=image, depth=depth))

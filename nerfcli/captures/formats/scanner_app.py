@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
+from nerfcli.captures.axes import opencv_pose
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed, read_json_object, vector
 from nerfcli.captures.formats.format import Format, UserInputs, has_keys
@@ -50,7 +50,7 @@ def parse_scanner_app(folder: Path, given: UserInputs = UserInputs()) -> Capture
         if pose is not None:
             depth, confidence = (folder / f"{path.stem.replace('frame', kind)}.png" for kind in ("depth", "conf"))
             found_depth = SensorDepth.found(depth, unit=MILLIMETRE, confidence=confidence)
-            frames.append(Frame(image.name, camera, opencv_from_opengl_pose(pose), image=image, depth=found_depth))
+            frames.append(Frame(image.name, camera, opencv_pose(pose, "opengl"), image=image, depth=found_depth))
     notes = (*found.notes, *poses.notes(), *fits.notes())
     if found.missing:
         notes += (f"{len(frames)} of the {len(files)} frames with a pose have a photo",)

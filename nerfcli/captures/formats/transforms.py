@@ -15,8 +15,8 @@ import numpy as np
 
 from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.conventions import opencv_from_opengl_pose, opengl_from_opencv_pose
 from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth, Size
+from nerfcli.captures.axes import opencv_pose, pose_in_axes
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.alicevision import find_alicevision
 from nerfcli.captures.formats.camera_path import find_camera_path
@@ -94,7 +94,7 @@ def write_transforms(capture: Capture, path: Path) -> None:
             record["mask_path"] = seen_from(path.parent, frame.mask)
         if frame.depth is not None and frame.depth.unit == MILLIMETRE:
             record["depth_file_path"] = seen_from(path.parent, frame.depth.path)
-        record["transform_matrix"] = opengl_from_opencv_pose(frame.world_from_cam).tolist()
+        record["transform_matrix"] = pose_in_axes(frame.world_from_cam, "opengl").tolist()
         records.append(record)
     cloud = path.with_name(f"{path.stem}_points.ply")
     if len(capture.points):
@@ -174,7 +174,7 @@ def listed_frames(
             continue
         if world_from_cam is None:
             continue
-        camera, pose = camera_of_record(record, own_size, where, fits), opencv_from_opengl_pose(world_from_cam)
+        camera, pose = camera_of_record(record, own_size, where, fits), opencv_pose(world_from_cam, "opengl")
         split, depth = splits.get(plain_name(texts[index])), _listed_depth(home, record, where)
         camera = cameras.setdefault(camera, camera)
         frames.append(Frame(names[index], camera, pose, places[index], masks[index], split=split, depth=depth))
