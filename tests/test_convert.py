@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from captures import photograph, with_photos
+from captures import photograph, reprojection_px, with_photos
 from commands import error_of, listing, nerfcli
 from views import BROWN, FISHEYE, PANORAMA, PINHOLE, PRISM, RADIAL, RATIONAL, SQUARE, capture_of
 
@@ -34,17 +34,6 @@ def model_of(tmp_path: Path, capture: Capture) -> Path:
         photograph(with_photos(capture, tmp_path / "images").frames)
     write_colmap_binary(capture, tmp_path / "in")
     return tmp_path / "in"
-
-
-def farthest_px(a: Capture, b: Capture) -> float:
-    """Return the largest distance between projections of a's points by two captures, with nerfcli's own cameras."""
-    worst = 0.0
-    for one, other in zip(a.frames, b.frames, strict=True):
-        first, seen = one.camera.project(rigid.apply(rigid.inverse(one.world_from_cam), a.points))
-        second, also = other.camera.project(rigid.apply(rigid.inverse(other.world_from_cam), a.points))
-        assert (seen == also).all()
-        worst = max(worst, float(np.linalg.norm(first - second, axis=1)[seen].max()))
-    return worst
 
 
 # Axes
@@ -80,7 +69,7 @@ def test_reading_in_a_convention_undoes_writing_in_it(axes, centre):
     capture = capture_of([PINHOLE, BROWN])
     convention = Convention(axes, pixel_centre=centre)
     again = reinterpreted(expressed(capture, convention, written_axes="opengl"), convention, parsed_axes="opengl")
-    assert farthest_px(capture, again) < 1e-9
+    assert reprojection_px(capture, again) < 1e-9
     assert again.observations is not None
     assert capture.observations is not None
     np.testing.assert_allclose(again.observations.pixels, capture.observations.pixels, rtol=0, atol=1e-12)
@@ -129,7 +118,7 @@ def test_colmap_to_a_format_and_back_moves_no_pixel(form, tmp_path):
     back = nerfcli("convert", report["path"], tmp_path / "back", "--to", "colmap", "--allow-loss", *more)
     assert back.exit_code == 0, back.stderr
     _, _, again = load(tmp_path / "back", UserInputs(), ConventionOverrides())
-    assert farthest_px(capture, again) < LIMIT_PX
+    assert reprojection_px(capture, again) < LIMIT_PX
 
 
 def test_axes_and_pixel_centre_of_the_written_file(tmp_path):
@@ -145,7 +134,7 @@ def test_axes_and_pixel_centre_of_the_written_file(tmp_path):
     assert content["cx"] == PINHOLE.params[2] - 0.5
     options = ("--from-axes", "opencv", "--from-pixel-center", "0")
     assert nerfcli("convert", out, tmp_path / "back", "--to", "colmap", *options).exit_code == 0
-    assert farthest_px(capture, load(tmp_path / "back", UserInputs(), ConventionOverrides())[2]) < LIMIT_PX
+    assert reprojection_px(capture, load(tmp_path / "back", UserInputs(), ConventionOverrides())[2]) < LIMIT_PX
 
 
 @pytest.mark.parametrize(
@@ -186,7 +175,7 @@ def test_a_file_that_holds_the_inverse_is_read_so(tmp_path):
     options = ("--from-axes", "opencv", "--from-inverted")
     result = nerfcli("convert", tmp_path / "wrong.json", tmp_path / "out", "--to", "colmap", *options)
     assert result.exit_code == 0, result.stderr
-    assert farthest_px(capture, load(tmp_path / "out", UserInputs(), ConventionOverrides())[2]) < LIMIT_PX
+    assert reprojection_px(capture, load(tmp_path / "out", UserInputs(), ConventionOverrides())[2]) < LIMIT_PX
 
 
 def test_intrinsics_for_another_size(tmp_path):

@@ -7,9 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from captures import reprojection_px
 from commands import error_of, listing, nerfcli
 from PIL import Image
-from test_convert import LIMIT_PX, farthest_px, model_of
+from test_convert import LIMIT_PX, model_of
 from test_scale import photos_of, sheet_of_markers
 from views import BROWN, PINHOLE, PRISM, capture_of
 
@@ -208,11 +209,11 @@ def test_other_programs_get_cameras_for_the_pixels_as_they_are_stored(form, plac
     result = nerfcli("convert", tmp_path / "scene", tmp_path / place, "--to", form, *options)
     assert result.exit_code == 0, result.stderr
     assert "3 photos have an EXIF orientation: the cameras refer to pixels as stored" in result.stderr
-    assert farthest_px(capture, load(tmp_path / place, UserInputs(), ConventionOverrides())[2]) < LIMIT_PX
+    assert reprojection_px(capture, load(tmp_path / place, UserInputs(), ConventionOverrides())[2]) < LIMIT_PX
     if form in ("colmap", "colmap-text", "transforms"):
         trained = load_scene(tmp_path)
         assert trained.kind == form.removesuffix("-text")
-        assert farthest_px(upright, replace(upright, frames=trained.frames)) < LIMIT_PX
+        assert reprojection_px(upright, replace(upright, frames=trained.frames)) < LIMIT_PX
 
 
 def test_which_pixels_can_be_chosen(tmp_path):
