@@ -9,13 +9,8 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.trajectories import (
-    losses_kitti,
-    losses_tum,
-    parse_kitti,
-    parse_tum,
-    write_tum,
-)
+from nerfcli.captures.formats.format import UserInputs
+from nerfcli.captures.formats.trajectories import KITTI, TUM, losses_kitti, losses_tum, write_tum
 from nerfcli.errors import BAD_INPUT, UserError
 
 CAMERA = Camera("OPENCV", 640, 480, (500, 510, 331, 236, 0.1, -0.05, 0.001, 0.002))
@@ -23,14 +18,14 @@ HALF = 0.5**0.5
 
 # At (1, 2, 3), turned a quarter about y: the camera's x axis points along world -z, its z axis along world x.
 POSE = [[0, 0, 1, 1], [0, 1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]]
-TUM = (
+TUM_TEXT = (
     f"# timestamp tx ty tz qx qy qz qw\n\n1305031102.1753 1 2 3 0 {HALF!r} 0 {HALF!r}\n1305031102.2112 0 0 0 0 0 0 1\n"
 )
-KITTI = "0 0 1 1 0 1 0 2 -1 0 0 3\n1 0 0 0 0 1 0 0 0 0 1 0\n"
+KITTI_TEXT = "0 0 1 1 0 1 0 2 -1 0 0 3\n1 0 0 0 0 1 0 0 0 0 1 0\n"
 
-PARSERS = {"tum": parse_tum, "kitti": parse_kitti}
+FORMATS = {"tum": TUM, "kitti": KITTI}
 LOSSES = {"tum": losses_tum, "kitti": losses_kitti}
-TEXTS = {"tum": TUM, "kitti": KITTI}
+TEXTS = {"tum": TUM_TEXT, "kitti": KITTI_TEXT}
 
 
 def capture_of(names: list[str]) -> Capture:
@@ -46,7 +41,7 @@ def capture_of(names: list[str]) -> Capture:
 def test_poses_by_hand(tmp_path, kind, names):
     path = tmp_path / "poses.txt"
     path.write_text(TEXTS[kind])
-    capture = PARSERS[kind](path, CAMERA)
+    capture = FORMATS[kind].parse(path, UserInputs(camera=CAMERA))
     assert [frame.name for frame in capture.frames] == names
     assert all(frame.camera == CAMERA and frame.image is None for frame in capture.frames)
     assert capture.kind == kind
@@ -83,12 +78,12 @@ def test_losses_are_reported():
     assert losses_kitti(capture_of(["a"])) == ("intrinsics of 1 camera", "names of 1 frames")
 
 
-@pytest.mark.parametrize("kind", PARSERS)
+@pytest.mark.parametrize("kind", FORMATS)
 def test_without_a_camera_the_message_requests_one(tmp_path, kind):
     path = tmp_path / "poses.txt"
     path.write_text(TEXTS[kind])
     with pytest.raises(UserError, match=f"a {kind.upper()} trajectory contains poses but no camera") as caught:
-        PARSERS[kind](path, None)
+        FORMATS[kind].parse(path, UserInputs())
     assert "--intrinsics" in caught.value.hint
 
 
@@ -114,6 +109,6 @@ def test_malformed_files_are_refused_with_file_and_line(tmp_path, kind, text, wh
     path = tmp_path / "poses.txt"
     path.write_text(text)
     with pytest.raises(UserError, match=what) as caught:
-        PARSERS[kind](path, CAMERA)
+        FORMATS[kind].parse(path, UserInputs(camera=CAMERA))
     assert caught.value.exit_code == BAD_INPUT
     assert str(path) in caught.value.message

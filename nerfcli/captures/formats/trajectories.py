@@ -1,7 +1,8 @@
 """Trajectories of the TUM and KITTI benchmarks: poses without cameras, pictures or points.
 
 TUM: a line "timestamp tx ty tz qx qy qz qw" for each pose. KITTI: a line with the first three rows of a 4x4 matrix, row
-by row; its frames are identified only by their order in the file. Both are world_from_cam with OpenCV axes.
+by row; its frames are identified only by their order in the file, in six digits as KITTI names its pictures. Both are
+world_from_cam with OpenCV axes.
 Sources: cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats; cvlibs.net/datasets/kitti, odometry devkit, readme.txt.
 """
 
@@ -15,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
-from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import (
@@ -28,7 +28,7 @@ from nerfcli.captures.formats.fields import (
     read_rows,
     shown,
 )
-from nerfcli.captures.formats.format import Format
+from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.limits import FramePoses, without
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, with_photos
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts
@@ -42,26 +42,6 @@ Poses = tuple[list[tuple[str, np.ndarray]], tuple[str, ...]]
 
 _NUMBER = re.compile(r"[+-]?\d{1,20}(\.\d{0,20})?([eE][+-]?\d{1,2})?", re.ASCII)
 _PICTURE = re.compile(r"\.(png|jpe?g|tiff?|bmp|webp)$", re.IGNORECASE)
-
-
-def parse_tum(path: Path, camera: Camera | None) -> Capture:
-    """Read a trajectory in the TUM format; a frame's name is its timestamp as written in the file.
-
-    Args:
-        camera: of all frames, since the file has none.
-
-    Raises:
-        UserError: the file is damaged (file and line are named), or no camera is given.
-    """
-    return _capture(path, camera, tum_poses, kind="tum")
-
-
-def parse_kitti(path: Path, camera: Camera | None) -> Capture:
-    """Read a trajectory in the KITTI format; a frame's name is its index in six digits, as KITTI names its pictures.
-
-    `camera` and the errors are those of `parse_tum`.
-    """
-    return _capture(path, camera, _kitti_poses, kind="kitti")
 
 
 def losses_tum(capture: Capture) -> tuple[str, ...]:
@@ -102,13 +82,18 @@ def write_kitti(capture: Capture, path: Path) -> None:
     _write([" ".join(map(repr, row)) for row in rows], path)
 
 
-def _capture(path: Path, camera: Camera | None, read: Callable[[Path], Poses], *, kind: str) -> Capture:
-    if camera is None:
+def _parsed(path: Path, given: UserInputs, read: Callable[[Path], Poses], *, kind: str) -> Capture:
+    """Read a trajectory, whose frames have the given camera, since the file has none, and their timestamps or numbers.
+
+    Raises:
+        UserError: the file is damaged (file and line are named), or no camera is given.
+    """
+    if given.camera is None:
         raise UserError(f"{path}: a {kind.upper()} trajectory contains poses but no camera", GIVE_CAMERA)
     poses, notes = read(path)
     check_unique_names((name for name, _ in poses), path)
-    frames = tuple(Frame(name, camera, world_from_cam) for name, world_from_cam in poses)
-    return Capture(frames, kind=kind, notes=notes)
+    frames = tuple(Frame(name, given.camera, world_from_cam) for name, world_from_cam in poses)
+    return with_photos(Capture(frames, kind=kind, notes=notes), given=given.images)
 
 
 def timed_rows(path: Path, expected: str) -> list[Row]:
@@ -185,7 +170,7 @@ TUM = Format(
     "a trajectory of the TUM RGB-D benchmark",
     ".txt with 8 or 12 numbers a line",
     lambda path: find_lines(path, columns=8),
-    lambda path, given: with_photos(parse_tum(path, given.camera), given=given.images),
+    lambda path, given: _parsed(path, given, tum_poses, kind="tum"),
     open_axes=True,
     default_name="trajectory.txt",
     files=("*.txt",),
@@ -201,7 +186,7 @@ KITTI = Format(
     "a trajectory of the KITTI odometry benchmark",
     ".txt with 8 or 12 numbers a line",
     lambda path: find_lines(path, columns=12),
-    lambda path, given: with_photos(parse_kitti(path, given.camera), given=given.images),
+    lambda path, given: _parsed(path, given, _kitti_poses, kind="kitti"),
     open_axes=True,
     default_name="poses.txt",
     files=("*.txt",),
