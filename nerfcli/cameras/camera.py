@@ -85,12 +85,12 @@ class Camera:
     @property
     def is_spherical(self) -> bool:
         """True if the picture covers the whole sphere (EQUIRECTANGULAR) and so has no focal length."""
-        return _colmap_camera(self).is_spherical()
+        return self.model == "EQUIRECTANGULAR"
 
     @property
     def focal_px(self) -> float:
         """Mean focal length in pixels; for a spherical picture, pixels per radian at its equator."""
-        return self.width / (2 * np.pi) if self.is_spherical else _colmap_camera(self).mean_focal_length()
+        return self.width / (2 * np.pi) if self.is_spherical else sum(self.focal_lengths) / 2
 
     @property
     def focal_lengths(self) -> tuple[float, float]:
@@ -102,14 +102,14 @@ class Camera:
     @property
     def pixel_aspect(self) -> float:
         """Focal length along y over that along x: 1 for square pixels."""
-        colmap = _colmap_camera(self)
-        return colmap.focal_length_y / colmap.focal_length_x if len(colmap.focal_length_idxs()) == 2 else 1.0
+        fx, fy = self.focal_lengths
+        return 1.0 if self.is_spherical else fy / fx
 
     @property
     def principal_point(self) -> tuple[float, float]:
         """Principal point in pixels (x, y)."""
-        index = _colmap_camera(self).principal_point_idxs()
-        return (self.params[index[0]], self.params[index[1]]) if index else (self.width / 2, self.height / 2)
+        values = self.values
+        return values.get("cx", self.width / 2), values.get("cy", self.height / 2)
 
     @property
     def fov_deg(self) -> tuple[float, float]:
@@ -313,11 +313,6 @@ def _complaint(model: str, values: dict[str, float]) -> str:
     if model == "FOV" and not abs(values["omega"]) < np.pi:
         return "omega is an angle in radians and must lie between -pi and pi"
     return ""
-
-
-@lru_cache(maxsize=256)
-def _colmap_camera(camera: Camera) -> pycolmap.Camera:
-    return pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=list(camera.params))
 
 
 @lru_cache(maxsize=256)
