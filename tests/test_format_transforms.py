@@ -228,10 +228,6 @@ def test_what_blender_cannot_hold_is_listed(tmp_path):
     )
     with pytest.raises(UserError, match="spherical picture"):
         write_blender(ring(CAMERAS["EQUIRECTANGULAR"]), tmp_path)
-    write_json(tmp_path / "transforms_val.json", frames=[])
-    with pytest.raises(UserError, match=r"transforms_val\.json already exists"):
-        write_blender(capture, tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["transforms_val.json"]
     with pytest.raises(UserError, match=r"transforms_train\.json: No such file"):
         parse_blender(tmp_path / "elsewhere")
 

@@ -7,7 +7,6 @@ Source: bmild/nerf load_blender.py.
 
 import math
 from collections import Counter
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -70,34 +69,23 @@ def losses_blender(capture: Capture) -> tuple[str, ...]:
 
 
 def write_blender(capture: Capture, folder: Path) -> None:
-    """Write a capture as transforms_{train,val,test}.json, for the splits that it has; all or none.
+    """Write a capture as transforms_{train,val,test}.json, for the splits that it has.
 
     Frames without a split are written to train. The angle of a file is the one that most of its frames have.
 
     Raises:
-        UserError: a spherical camera, an existing file of a split without frames, or a file that cannot be written.
+        UserError: a spherical camera, or a file that cannot be written.
     """
     refuse_spherical(capture, "field of view")
-    by_split = _by_split(capture)
-    stale = [_file(folder, split) for split in SPLITS if split not in by_split and _file(folder, split).exists()]
-    if stale:
-        raise UserError(
-            f"{stale[0]} already exists and belongs to another capture", "remove it or choose another folder"
-        )
-    with ExitStack() as undo:
-        for split, frames in by_split.items():
-            path = _file(folder, split)
-            records = [
-                {
-                    "file_path": _file_path(frame, folder),
-                    "transform_matrix": pose_in_axes(frame.world_from_cam, "opengl").tolist(),
-                }
-                for frame in frames
-            ]
-            if not path.exists():
-                undo.callback(path.unlink, missing_ok=True)
-            write_json(path, {"camera_angle_x": _shared_angle(frames), "frames": records})
-        undo.pop_all()
+    for split, frames in _by_split(capture).items():
+        records = [
+            {
+                "file_path": _file_path(frame, folder),
+                "transform_matrix": pose_in_axes(frame.world_from_cam, "opengl").tolist(),
+            }
+            for frame in frames
+        ]
+        write_json(_file(folder, split), {"camera_angle_x": _shared_angle(frames), "frames": records})
 
 
 def _file(folder: Path, split: str) -> Path:

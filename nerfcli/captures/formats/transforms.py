@@ -6,7 +6,6 @@ Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips
 
 import os
 from collections.abc import Sequence
-from contextlib import ExitStack
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -96,16 +95,11 @@ def write_transforms(capture: Capture, path: Path) -> None:
             record["depth_file_path"] = seen_from(path.parent, frame.depth.path)
         record["transform_matrix"] = pose_in_axes(frame.world_from_cam, "opengl").tolist()
         records.append(record)
-    cloud = path.with_name(f"{path.stem}_points.ply")
     if len(capture.points):
+        cloud = path.with_name(f"{path.stem}_points.ply")
+        write_points(capture, cloud)
         content["ply_file_path"] = cloud.name
-    with ExitStack() as undo:
-        if len(capture.points):
-            existed = cloud.exists()
-            write_points(capture, cloud)
-            undo.callback(lambda: None if existed else cloud.unlink(missing_ok=True))
-        write_json(path, {**content, "frames": records})
-        undo.pop_all()
+    write_json(path, {**content, "frames": records})
 
 
 def records_of(path: Path, content: dict[str, Any], key: str = "frames") -> list[tuple[dict[str, Any], str]]:
