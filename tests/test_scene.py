@@ -159,11 +159,6 @@ def test_malformed_scene_json_is_refused(own, changes, what):
     assert caught.value.exit_code == BAD_INPUT
 
 
-def test_save_refuses_an_unknown_unit(own, tmp_path):
-    with pytest.raises(ValueError, match="unit must be one of"):
-        save(own, image_folder=tmp_path, provenance={}, unit="mile")
-
-
 def test_what_is_no_scene_says_what_was_looked_for(tmp_path):
     with pytest.raises(UserError, match=r"nowhere does not exist"):
         load_scene(tmp_path / "nowhere")

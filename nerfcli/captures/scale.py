@@ -9,7 +9,7 @@ import math
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -56,15 +56,7 @@ class ScaleEstimate:
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields and "rms_residual" as a JSON object, with the residuals as an object by name."""
-        return {
-            "metres_per_unit": self.metres_per_unit,
-            "standard_error": self.standard_error,
-            "residuals": dict(self.residuals),
-            "residual_unit": self.residual_unit,
-            "rms_residual": self.rms_residual,
-            "source": self.source,
-            "details": self.details,
-        }
+        return asdict(self) | {"residuals": dict(self.residuals), "rms_residual": self.rms_residual}
 
 
 def jackknife(x: np.ndarray, y: np.ndarray) -> float:
@@ -138,7 +130,7 @@ def known_distance(text: str, frames: Sequence[Frame]) -> KnownDistance:
 
 
 def scale_from_distances(distances: Sequence[KnownDistance]) -> ScaleEstimate:
-    """Estimate metres per unit by weighted least squares of the logarithm.
+    """Estimate metres per unit from one or more distances by weighted least squares of the logarithm.
 
     log s = sum_i w_i log(metres_i / units_i) / sum_i w_i,  w_i = (metres_i / tolerance_i)^2
 
@@ -149,12 +141,7 @@ def scale_from_distances(distances: Sequence[KnownDistance]) -> ScaleEstimate:
         The estimate. With tolerances, its standard error is s / sqrt(sum w), times sqrt(chi^2 / (n - 1)) if that is
         above 1, when the distances disagree by more than their tolerances. Without tolerances, it is that of the mean,
         from the scatter of the distances, and None for a single distance. It excludes errors that all distances share.
-
-    Raises:
-        ValueError: no distance.
     """
-    if not distances:
-        raise ValueError("scale_from_distances needs at least one distance")
     logs = np.log([distance.metres / distance.units for distance in distances])
     tolerances = [distance.tolerance for distance in distances]
     relative = np.array([t / d.metres for t, d in zip(tolerances, distances, strict=True) if t is not None])

@@ -61,8 +61,6 @@ def save(
     Raises:
         UserError: the model cannot be read, or scene.json cannot be written.
     """
-    if unit not in UNITS:
-        raise ValueError(f"unit must be one of {UNITS}, got {unit!r}")
     model = read_model(scene_dir / MODEL_FOLDER)
     points = model.points
     if split is None:
@@ -237,14 +235,9 @@ def write_scene(capture: Capture, folder: Path) -> None:
     provenance is recorded beside the command and the version.
 
     Raises:
-        UserError: a frame has no photo, no photo is on disk, or the folder cannot be written.
+        UserError: a frame has no photo, or the folder cannot be written.
     """
     image_folder, names = _named(capture)
-    if not any(frame.has_photo for frame in capture.frames):
-        raise UserError(
-            f"none of the {len(capture.frames)} photos exists, such as {capture.frames[0].image}",
-            "a scene needs its photos; give their folder with --images",
-        )
     capture = replace(
         capture, frames=tuple(replace(frame, name=name) for frame, name in zip(capture.frames, names, strict=True))
     )
