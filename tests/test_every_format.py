@@ -17,6 +17,14 @@ from nerfcli.captures.loading import describe_source, load_scene
 from nerfcli.errors import BAD_INPUT, UserError
 
 CAMERA = Camera.pinhole(64, 48, 70.0)  # the only kind of lens that all formats hold
+ONE_FOCAL_LENGTH = Camera("PINHOLE", 64, 48, (70.0, 70.0, 30.25, 25.5))
+TWO_FOCAL_LENGTHS = Camera("PINHOLE", 64, 48, (70.0, 71.5, 30.25, 25.5))
+# The lens that a format's sample can have, if that is not one with two focal lengths.
+LENSES = {
+    **dict.fromkeys(("blender", "llff", "bundler"), CAMERA),
+    **dict.fromkeys(("metashape", "reality-capture", "openmvg"), ONE_FOCAL_LENGTH),
+}
+METRIC = ("polycam", "record3d", "stray-scanner", "3d-scanner-app", "euroc", "tum-rgbd", "scannetpp")
 ROTATIONS = Rotation.from_rotvec([[0.1, -0.4, 0.2], [1.3, 0.2, -0.7], [-0.5, 2.1, 0.3]])
 POSES = rigid.from_parts(ROTATIONS.as_matrix(), np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 2.0], [0.1, -3.0, 1.5]]))
 VIEWS = Views(CAMERA, POSES)
@@ -37,18 +45,20 @@ def test_every_format_that_is_read_is_tested():
 
 @pytest.mark.parametrize("name", WITH_PHOTOS)
 def test_a_capture_with_photos_is_trained_on(name, tmp_path):
-    file = WITH_PHOTOS[name](VIEWS, tmp_path)
+    camera = LENSES.get(name, TWO_FOCAL_LENGTHS)
+    file = WITH_PHOTOS[name](Views(camera, POSES), tmp_path)
     place = file if name == "run" else tmp_path  # a folder of a run is taken for a mistake
     scene = load_scene(place)
     kind = name.removesuffix("-text")
     assert (scene.kind, scene.missing, len(scene.frames)) == (kind, (), 3)
+    assert scene.unit == ("metre" if name in METRIC else "arbitrary")
     assert len(scene.test_frames) == 1
     for frame in scene.frames:
         index = int(re.findall(r"\d+", Path(frame.name).stem)[-1]) % 1000
-        np.testing.assert_allclose(frame.world_from_cam, POSES[index], rtol=0, atol=1e-9)
-        assert frame.camera.size == CAMERA.size
-        np.testing.assert_allclose(frame.camera.focal_lengths, (70, 70), rtol=1e-9)
-        np.testing.assert_allclose(frame.camera.principal_point, (32, 24), rtol=1e-9)
+        np.testing.assert_allclose(frame.world_from_cam, POSES[index], rtol=0, atol=1e-12)
+        assert frame.camera.size == camera.size
+        np.testing.assert_allclose(frame.camera.focal_lengths, camera.focal_lengths, rtol=1e-12)
+        np.testing.assert_allclose(frame.camera.principal_point, camera.principal_point, rtol=1e-12)
         assert frame.has_photo
     assert re.fullmatch(rf"{tmp_path}.*: {kind} \(.+\), 3 of 3 photos on disk", describe_source(place, scene))
     if file.is_file() and name not in ("nerfcli", "polycam", "mvsnet", "pose-files"):  # found by a file, not a folder

@@ -43,23 +43,6 @@ def parse(folder: Path, given: UserInputs = UserInputs()) -> tuple[str, Capture]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_views_written_by_hand_come_back(tmp_path, name):
-    write(name, tmp_path)
-    kind, capture = parse(tmp_path)
-    assert (kind, capture.kind) == (name, name)
-    assert capture.missing == ()
-    assert len(capture.frames) == len(POSES)
-    for frame, pose in zip(capture.frames, POSES, strict=True):
-        np.testing.assert_allclose(frame.world_from_cam, pose, rtol=0, atol=1e-13)
-        assert (frame.camera.model, frame.camera.width, frame.camera.height) == ("PINHOLE", *SIZE)
-        np.testing.assert_allclose(frame.camera.params, CAMERA.params, rtol=1e-12)
-        assert frame.image is not None
-        assert frame.image.is_file()
-        assert frame.name == frame.image.name
-    assert capture.unit == ("metre" if name in ("polycam", "record3d") else "arbitrary")
-
-
-@pytest.mark.parametrize("name", NAMES)
 def test_a_missing_photo_is_listed(tmp_path, name):
     write(name, tmp_path)
     photos = sorted((*tmp_path.rglob("*.jpg"), *tmp_path.rglob("image/*.png")))

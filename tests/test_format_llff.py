@@ -2,7 +2,6 @@
 
 import io
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,23 +19,12 @@ def pinhole_ring() -> Capture:
     return ring(Camera.pinhole(640, 480, 500.0), Camera.pinhole(400, 480, 450.0))
 
 
-def test_a_written_array_is_read_back(tmp_path):
+def test_views_of_two_cameras_without_photos_are_numbered(tmp_path):
     capture = replace(pinhole_ring(), depth_bounds=np.column_stack([np.arange(1.0, 7.0), np.full(6, 9.0)]))
     write_llff(capture, tmp_path)
-    rows = np.load(tmp_path / "poses_bounds.npy")
-    assert rows.shape == (6, 17)
-    np.testing.assert_array_equal(rows[:, [4, 9, 14]], [[480, 640, 500], [480, 400, 450]] * 3)
     back = parse_llff(tmp_path)
     assert reprojection_px(capture, back) < 1e-10
-    np.testing.assert_array_equal(back.depth_bounds, capture.depth_bounds)
-    assert [frame.name for frame in back.frames] == [f"image{index:03d}" for index in range(6)]
-    assert all(frame.image is None for frame in back.frames)
-    (tmp_path / "images").mkdir()
-    for frame in capture.frames:
-        (tmp_path / "images" / Path(frame.name).name).write_bytes(b"")
-    back = parse_llff(tmp_path)
-    assert [frame.image for frame in back.frames] == sorted((tmp_path / "images").iterdir())
-    assert back.frames[0].name == "images/ä 00.jpg"
+    assert [(frame.name, frame.image) for frame in back.frames] == [(f"image{index:03d}", None) for index in range(6)]
 
 
 def test_rows_are_in_the_order_of_the_photos_names(tmp_path):
