@@ -317,7 +317,7 @@ def test_coordinates_of_the_globe_are_compared_as_finely_as_float64_can(tmp_path
         replace(f, world_from_cam=rigid.from_parts(f.world_from_cam[:3, :3], f.centre + 5e6)) for f in capture.frames
     )
     capture = replace(capture, frames=moved, points=capture.points + 5e6)
-    done = convert(capture, tmp_path / "out", source_format="made", wanted=TargetOptions(format_named("colmap")))
+    done = convert(capture, tmp_path / "out", TargetOptions(format_named("colmap")))
     assert done.check.max_px < 1e-6 < done.check.tolerance_px < 1e-5
 
 
@@ -331,7 +331,7 @@ def test_points_alone(tmp_path):
     shifted = replace(capture, points=capture.points + 1e-9)
     wrong = replace(format_named("ply"), write=lambda _, path: write_points(shifted, path))
     with pytest.raises(UserError, match="60 points instead of 60, or other positions"):
-        convert(capture, tmp_path / "2.ply", source_format="made", wanted=TargetOptions(wrong, allow_loss=True))
+        convert(capture, tmp_path / "2.ply", TargetOptions(wrong, allow_loss=True))
 
 
 # The command
@@ -398,7 +398,7 @@ def test_photos_of_a_model_are_found_whatever_its_names_are_relative_to(prefix, 
     capture = replace(capture_of([PINHOLE]), observations=None)
     photograph(with_photos(capture, tmp_path / "images").frames)
     capture = replace(capture, frames=tuple(replace(f, name=prefix + f.name) for f in capture.frames))
-    convert(capture, tmp_path / "sparse" / "0", source_format="made", wanted=TargetOptions(format_named("colmap")))
+    convert(capture, tmp_path / "sparse" / "0", TargetOptions(format_named("colmap")))
     result = nerfcli("convert", tmp_path, tmp_path / "elsewhere" / "transforms.json", "--to", "transforms")
     assert result.exit_code == 0, result.stderr
     content = json.loads((tmp_path / "elsewhere" / "transforms.json").read_text())

@@ -67,7 +67,7 @@ def split_into(capture: Capture, *splits: str | None) -> Capture:
 def made_scene(capture: Capture, folder: Path, *, allow_loss: bool = False) -> None:
     """Convert a capture to a scene of nerfcli."""
     wanted = TargetOptions(format_named("nerfcli"), allow_loss=allow_loss)
-    convert(capture, folder, source_format="made", wanted=wanted)
+    convert(capture, folder, wanted)
 
 
 def seen_upright(capture: Capture, index: int, orientation: int) -> np.ndarray:

@@ -124,7 +124,6 @@ class Conversion:
     """
 
     path: Path
-    source_format: str
     capture: Capture
     losses: tuple[str, ...]
     loss_px: float
@@ -161,7 +160,7 @@ def load(source: Path, given: UserInputs, overrides: ConventionOverrides) -> tup
     return form, found, capture
 
 
-def convert(capture: Capture, target: Path, *, source_format: str, wanted: TargetOptions) -> Conversion:
+def convert(capture: Capture, target: Path, wanted: TargetOptions) -> Conversion:
     """Write a capture in another format, read it back, and compare.
 
     The file is kept only if cameras, poses and points agree, but for accepted losses; otherwise the previous files are
@@ -203,7 +202,7 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Targe
     with _kept_on_success(path, there, files):
         form.write(expressed(capture, convention, written_axes=form.axes), path)
         checked, loss_px = _checked(capture, path, form, convention)
-    return Conversion(path, source_format, capture, losses, loss_px, checked, _orientation_notes(turned))
+    return Conversion(path, capture, losses, loss_px, checked, _orientation_notes(turned))
 
 
 def _pixels(form: Format, wanted: TargetOptions) -> str:

@@ -120,17 +120,6 @@ def turned(camera: Camera, world_from_cam: np.ndarray, *, orientation: int) -> t
     return upright, world_from_cam @ stored_from_upright
 
 
-def turned_pixels(pixels: np.ndarray, sizes: np.ndarray, *, orientation: int) -> np.ndarray:
-    """Turn positions (N, 2) in stored pictures of `sizes` (N, 2), width and height, into those in upright pictures."""
-    middles = sizes / 2
-    return (pixels - middles) @ _TURNS[orientation].T + (middles[:, ::-1] if orientation in (6, 8) else middles)
-
-
-def turn_back(orientation: int) -> int:
-    """Return the EXIF orientation that undoes another one."""
-    return {6: 8, 8: 6}.get(orientation, orientation)
-
-
 def rescaling(calibrated: Camera, fitted: Camera) -> tuple[Size, Size] | None:
     """Return the sizes of a calibration and of the picture it was fitted to, both upright; None if they are equal."""
     size, other = fitted.size, calibrated.size
@@ -258,7 +247,9 @@ def _turned_observations(capture: Capture, turns: np.ndarray) -> Observations | 
     sizes = np.array([frame.camera.size for frame in capture.frames])
     for orientation in set(turns.tolist()) - {1}:
         rows = turns[seen.frame_index] == orientation
-        pixels[rows] = turned_pixels(pixels[rows], sizes[seen.frame_index[rows]], orientation=orientation)
+        middles = sizes[seen.frame_index[rows]] / 2
+        upright_middles = middles[:, ::-1] if orientation in (6, 8) else middles
+        pixels[rows] = (pixels[rows] - middles) @ _TURNS[orientation].T + upright_middles
     return replace(seen, pixels=pixels)
 
 
@@ -268,7 +259,7 @@ def _turn(frame: Frame, pixels: str) -> int:
     measured = width, height, written = measure(frame.image)
     orientation, size = turn_to_upright(frame.camera, measured, path=frame.image)
     if pixels == STORED:
-        orientation, size = turn_back(written), (width, height)
+        orientation, size = {6: 8, 8: 6}.get(written, written), (width, height)  # turned back
     try:
         frame.camera.resized(*size)
     except UserError as error:

@@ -64,7 +64,7 @@ def convert_capture(
         )
     frame = {"new_from_old": moved.new_from_old.to_json()} | ({} if scale is None else {"scale": scale.to_json()})
     capture = replace(moved.capture, provenance={"source": str(found), **frame})
-    done = convert(capture, target, source_format=form.name, wanted=wanted)
+    done = convert(capture, target, wanted)
     for text in done.notes:
         reporter.note(text)
     suffixes = {frame.image.suffix.lower() for frame in done.capture.frames if frame.image is not None}
@@ -74,7 +74,7 @@ def convert_capture(
         reporter.warn(f"{to} cannot hold {loss}")
     if done.loss_px > TOLERANCE_PX:
         reporter.warn(f"dropping lens parameters shifts pixels by up to {done.loss_px:.3g} px")
-    return done, _record(done, to) | frame
+    return done, {"from": form.name, "to": to} | _record(done) | frame
 
 
 def _with_frames(source: Path, output: Output, given: UserInputs, reporter: Reporter) -> UserInputs:
@@ -194,10 +194,8 @@ def contents(capture: Capture) -> str:
     )
 
 
-def _record(done: Conversion, to: str) -> dict[str, Any]:
+def _record(done: Conversion) -> dict[str, Any]:
     return {
-        "from": done.source_format,
-        "to": to,
         "images": len(done.capture.frames),
         "cameras": len({frame.camera for frame in done.capture.frames}),
         "points": len(done.capture.points),
