@@ -350,6 +350,8 @@ def test_stdout_is_the_path_and_stderr_the_report(tmp_path):
     ("out", "form", "more", "message"),
     [
         ("out.json", "transforms", (), "out.json exists"),
+        ("out.json", "colmap", (), "out.json is a file"),
+        ("out.json", "colmap", ("--overwrite",), "out.json is a file"),
         ("out.json/model", "colmap", (), "cannot write"),
         ("photos", "colmap", ("--overwrite",), "photos"),
     ],

@@ -206,6 +206,8 @@ def write_colmap_text(capture: Capture, path: Path) -> None:
 def _write(capture: Capture, path: Path, suffix: str, *, wrong: list[str]) -> None:
     if wrong:
         raise UserError(f"the name {wrong[0]!r} cannot be written to a COLMAP model", "rename the photo")
+    if path.is_file():
+        raise UserError(f"{path} is a file", "give the folder of the model, such as sparse/0")
     others = {item.name for item in path.iterdir()} - set(MODEL_FILES) if path.is_dir() else set()
     if others:
         raise UserError(
