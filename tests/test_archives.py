@@ -146,6 +146,20 @@ def test_links_encrypted_files_and_equal_names_are_refused(tmp_path):
         unpack(path, tmp_path / "scene")
 
 
+def test_a_compression_that_is_not_supported_is_not_called_damage(tmp_path):
+    """Explorer packs files of more than 2 GB with Deflate64, method 9."""
+    path = tmp_path / "walk.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.txt", "a")
+    data = bytearray(path.read_bytes())
+    data[8] = data[data.index(b"PK\x01\x02") + 10] = 9
+    path.write_bytes(data)
+    with pytest.raises(UserError, match=r"walk.zip cannot be unpacked: .*compression") as caught:
+        unpack(path, tmp_path / "scene")
+    assert caught.value.hint.startswith("unpack it with another program")
+    assert [item.name for item in tmp_path.iterdir()] == ["walk.zip"]
+
+
 def test_a_bomb_is_refused_before_anything_is_written(tmp_path):
     path = tmp_path / "bomb.zip"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:

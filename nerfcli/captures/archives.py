@@ -37,7 +37,7 @@ _BLOCK_BYTES = 1 << 20
 # What macOS and Windows add to archives.
 _LITTER = ("__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini")
 _DAMAGED = (
-    *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, ValueError, NotImplementedError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, ValueError, RuntimeError),
     *(OverflowError, KeyError, IndexError),
 )
 
@@ -73,12 +73,15 @@ def unpacked(path: Path, output: Output, *, reporter: Reporter) -> Path:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
-    hint = "copy or download it again"
     try:
         with zipfile.ZipFile(path) as archive:
             yield archive
+    except NotImplementedError as error:  # a method of compression, such as Deflate64
+        raise UserError(
+            f"{path} cannot be unpacked: {error}", "unpack it with another program, and give the folder"
+        ) from error
     except _DAMAGED as error:
-        raise UserError(f"{path} is not a readable zip archive: {error}", hint) from error
+        raise UserError(f"{path} is not a readable zip archive: {error}", "copy or download it again") from error
 
 
 def _checked(path: Path, entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:
