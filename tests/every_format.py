@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -67,6 +68,10 @@ def numbers(values: np.ndarray) -> str:
 
 def matrix_text(matrix: np.ndarray) -> str:
     return "\n".join(map(numbers, matrix)) + "\n"
+
+
+def change_json(path: Path, **change: Any) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
 
 
 def text(path: Path, content: str) -> Path:

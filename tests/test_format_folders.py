@@ -2,11 +2,10 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from every_format import WITH_PHOTOS, Views, matrix_text, text
+from every_format import WITH_PHOTOS, Views, change_json, matrix_text, text
 from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
@@ -31,10 +30,6 @@ def write(name: str, folder: Path) -> Path:
 
 def photo(path: Path) -> None:
     VIEWS.put(0, path)
-
-
-def change_json(path: Path, **change: Any) -> None:
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
 
 
 def parse(folder: Path, given: UserInputs = UserInputs()) -> tuple[str, Capture]:

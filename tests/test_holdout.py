@@ -13,6 +13,7 @@ NAMES = [f"frame_{index}.png" for index in range(1, 21)]
 
 def test_every_n_counts_names_in_order():
     assert names_held_out("every:5", ["d", "b", "a", "c", "f", "e"]) == {"a", "f"}
+    assert default_split([]) == frozenset()
 
 
 def test_a_block_is_the_middle_of_the_capture_with_numbers_counted():

@@ -4,12 +4,11 @@ import json
 import math
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from clips import encode
-from every_format import OPENGL, WITH_PHOTOS, Views, numbers, text
+from every_format import OPENGL, WITH_PHOTOS, Views, change_json, numbers, text
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
@@ -34,10 +33,6 @@ VIEWS = Views(CAMERA, POSES)
 def parse(place: Path, given: UserInputs = UserInputs()) -> Capture:
     form, found = recognise(place)
     return form.parse(found, given)
-
-
-def change_json(path: Path, **change: Any) -> None:
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
 
 
 def replace_in(path: Path, old: str, new: str) -> None:

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.layout import centres_of, surrounds, up_direction, views_of
-from nerfcli.cameras.paths import ellipse, fly, focus_point, interpolate, orbit, spiral
+from nerfcli.cameras.layout import centres_of, focus_point, surrounds, up_direction, views_of
+from nerfcli.cameras.paths import ellipse, fly, interpolate, orbit, spiral
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 

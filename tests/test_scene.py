@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from every_format import change_json
 from PIL import Image
 
 from nerfcli.cameras import rigid
@@ -15,7 +16,6 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.captures.formats.colmap import write_colmap_binary
 from nerfcli.captures.formats.scene_folder import save
 from nerfcli.captures.formats.transforms import parse_transforms
-from nerfcli.captures.holdout import default_split
 from nerfcli.captures.loading import fingerprint, load_scene
 from nerfcli.errors import BAD_INPUT, UserError
 
@@ -64,29 +64,15 @@ def own(tmp_path, model) -> Path:
     return folder
 
 
-def edit(folder: Path, **changes: object) -> None:
-    path = folder / "scene.json"
-    path.write_text(json.dumps({**json.loads(path.read_text(encoding="utf-8")), **changes}), encoding="utf-8")
-
-
-def test_every_eighth_name_is_held_out():
-    names = [f"{index:02d}" for index in range(20)]
-    assert default_split(reversed(names)) == {"00", "08", "16"}
-    assert default_split([]) == frozenset()
-
-
 def test_splits_that_nerfstudio_lists_are_kept(tmp_path):
     for name in "abcd":
         write_image(tmp_path / f"{name}.png")
     write_transforms(tmp_path, [f"{name}.png" for name in "abcd"])
     path = tmp_path / "transforms.json"
-    content = json.loads(path.read_text())
-    path.write_text(json.dumps({**content, "train_filenames": ["a.png", "b.png"], "val_filenames": ["c.png"]}))
+    change_json(path, train_filenames=["a.png", "b.png"], val_filenames=["c.png"])
     assert load_scene(tmp_path).test_names == {"c.png"}  # held out for want of a test split; d is not used
     assert [frame.name for frame in load_scene(tmp_path).frames] == ["a.png", "b.png", "c.png"]
-    path.write_text(
-        json.dumps({**content, "train_filenames": ["a.png"], "val_filenames": ["c.png"], "test_filenames": ["d.png"]})
-    )
+    change_json(path, train_filenames=["a.png"], test_filenames=["d.png"])
     assert [frame.name for frame in load_scene(tmp_path).frames] == ["a.png", "d.png"]
     assert load_scene(tmp_path).test_names == {"d.png"}
 
@@ -153,7 +139,7 @@ def test_own_scene_is_read_back(own, tmp_path):
     ],
 )
 def test_malformed_scene_json_is_refused(own, changes, what):
-    edit(own, **changes)
+    change_json(own / "scene.json", **changes)
     with pytest.raises(UserError, match=what) as caught:
         load_scene(own)
     assert caught.value.exit_code == BAD_INPUT

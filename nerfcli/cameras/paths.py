@@ -151,9 +151,6 @@ def _without_repeats(poses: np.ndarray) -> np.ndarray:
     return np.stack(kept)
 
 
-__all__ = ["ellipse", "focus_point", "interpolate", "orbit", "spiral"]
-
-
 # Fraction of the cameras' spread that a path uses: nothing was observed from beyond its rim.
 _INSIDE = 0.8
 

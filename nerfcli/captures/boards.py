@@ -236,7 +236,7 @@ def _edge(grey: np.ndarray, a: np.ndarray, b: np.ndarray, middle: np.ndarray) ->
         normal = np.linalg.svd(points[near] - mean)[2][1]
         line = np.array([*normal, normal @ mean])
         off = np.abs(points @ normal - line[2])
-        near = off <= 3 * 1.4826 * np.median(off) + 1e-3
+        near = off <= 3 * _SIGMA_PER_MAD * np.median(off) + 1e-3
     return line
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.paths import focus_point
+from nerfcli.cameras.layout import focus_point
 from nerfcli.cameras.rigid import Similarity, apply, inverse
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import UserError
