@@ -16,7 +16,7 @@ import pytest
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import ExifTags, Image, ImageCms, ImageOps
+from PIL import ExifTags, Image, ImageCms, ImageOps, TiffImagePlugin
 from PIL.TiffImagePlugin import IFDRational
 
 from nerfcli.errors import BAD_INPUT, UserError
@@ -110,6 +110,16 @@ def test_every_orientation_is_applied_once_as_pillow_does(tmp_path, orientation,
     assert (found.orientation, found.width, found.height) == (orientation, *image_size(path))
 
 
+@pytest.mark.parametrize("mode", ["L", "I;16", "P", "RGB", "RGBA", "CMYK"])
+def test_an_uncompressed_tiff_is_turned_in_every_mode(tmp_path, mode):
+    """Pillow maps some of them into memory, with width and height exchanged."""
+    path, stored = tmp_path / "photo.tif", Image.fromarray(noise(5, 7, 3)).convert("L" if mode == "I;16" else mode)
+    stored.convert(mode).save(path)
+    expected = np.rot90(read_image(path), -1)
+    stored.convert(mode).save(path, tiffinfo={ExifTags.Base.Orientation: 6})
+    np.testing.assert_array_equal(read_image(path), expected)
+
+
 @pytest.mark.parametrize("orientation", [0, 9, 65535])
 def test_an_orientation_out_of_range_reads_as_upright(tmp_path, orientation):
     path, stored = tmp_path / "photo.png", noise(2, 3, 3)
@@ -154,6 +164,24 @@ def test_colours_of_16_bits_that_were_8_come_back_exactly(tmp_path, suffix):
     cv2 = pytest.importorskip("cv2")
     path, pixels = tmp_path / f"colour{suffix}", noise(6, 5, 3)
     cv2.imwrite(str(path), pixels[..., ::-1].astype(np.uint16) * 257)
+    np.testing.assert_array_equal(read_image(path), pixels)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("prefix", [b"II*\0", b"MM\0*"])
+def test_a_tiff_with_a_plane_for_each_colour(tmp_path, bits, prefix):
+    path, pixels = tmp_path / "planes.tif", noise(5, 7, 3)
+    plane = 35 * bits // 8
+    header = TiffImagePlugin.ImageFileDirectory_v2(prefix + bytes(4))
+    size = {"ImageWidth": 7, "ImageLength": 5, "RowsPerStrip": 5}
+    kind = {"Compression": 1, "PhotometricInterpretation": 2, "SamplesPerPixel": 3, "PlanarConfiguration": 2}
+    planes = {"BitsPerSample": [bits] * 3, "StripByteCounts": [plane] * 3, "StripOffsets": [0, plane, 2 * plane]}
+    for name, value in {**size, **kind, **planes}.items():
+        header[ExifTags.Base[name]] = value
+    with path.open("wb") as file:
+        header.save(file)
+        samples = pixels if bits == 8 else pixels.astype("<u2" if prefix[:1] == b"I" else ">u2") * 257
+        file.write(np.moveaxis(samples, 2, 0).tobytes())
     np.testing.assert_array_equal(read_image(path), pixels)
 
 

@@ -37,6 +37,8 @@ pi_heif.register_heif_opener()
 
 # Pillow refuses twice this as an attack: by default 179 megapixels, but phones take photos of 200. Now it is 536.
 _MOST_PIXELS = Image.MAX_IMAGE_PIXELS = 2**28
+# Without libtiff, Pillow garbles some uncompressed TIFF files: with a 16-bit plane per colour, or turned by 90 degrees.
+TiffImagePlugin.READ_LIBTIFF = True  # type: ignore[bad-assignment]
 
 _UPRIGHT_FROM_STORED = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -281,9 +283,8 @@ def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
         image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
     if image.mode in ("I", "F"):
         kind = "integer" if image.mode == "I" else "float"
-        raise UserError(
-            f"{path} has 32-bit {kind} pixels, whose white level is unknown", "save it with 8 or 16 bits per channel"
-        )
+        what = f"{path} has 32-bit {kind} pixels, whose white level is unknown"
+        raise UserError(what, "save it with 8 or 16 bits per channel")
     if mode == "RGBA" or image.mode not in ("RGB", "L", "CMYK"):
         image = image.convert(mode)
     if profile:
