@@ -34,7 +34,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts
 from nerfcli.captures.capture import Capture
-from nerfcli.errors import BAD_INPUT, INTERRUPTED
+from nerfcli.errors import BAD_INPUT, INTERRUPTED, UserError
 from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.machine import Resources, processor_name
@@ -136,6 +136,16 @@ def test_a_photo_that_is_some_levels_off_has_the_psnr_of_that():
         assert SampledPixels.drawn([shifted], seed=0).psnr(model) == pytest.approx(20 * np.log10(255 / off), abs=0.5)
     assert len(SampledPixels.drawn([photo], seed=0).pixels[0]) == 18 * 24
     assert len(SampledPixels.drawn([shifted], seed=0).pixels[0]) == inside.sum()
+
+
+def test_photos_that_masks_hide_are_left_out_of_the_sample():
+    model, photo = towards_fog()
+    hidden = replace(photo, used=np.zeros((18, 24), bool))
+    sample = SampledPixels.drawn([hidden, photo], seed=0)
+    assert sample.psnr(model) == SampledPixels.drawn([photo], seed=0).psnr(model)
+    assert "pixels of 1 held-out photos" in sample.protocol()
+    with pytest.raises(UserError, match="no pixels of the photos are left"):
+        SampledPixels.drawn([hidden], seed=0)
 
 
 def test_the_error_of_steps_shrinks_with_the_step():

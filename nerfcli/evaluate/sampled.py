@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import compare
 from nerfcli.evaluate.photos import HeldOutPhoto, as_exposed, background_of, over_white
 from nerfcli.evaluate.protocol import PROTOCOL
@@ -21,10 +22,10 @@ _RAYS = 4096
 
 @dataclass(frozen=True)
 class SampledPixels:
-    """Random pixels of all held-out photos, equally many of each, and the same for every field that is measured.
+    """Random pixels of held-out photos, equally many of each, and the same for every field that is measured.
 
     Args:
-        photos: the held-out photos.
+        photos: the held-out photos of which masks leave something.
         pixels: for each photo, the indices of its pixels, counted row by row.
     """
 
@@ -33,7 +34,17 @@ class SampledPixels:
 
     @staticmethod
     def drawn(photos: Sequence[HeldOutPhoto], *, seed: int) -> "SampledPixels":
-        """Draw `SAMPLED_PIXELS` in total, equally many per photo, or all of a photo's usable pixels if it has fewer."""
+        """Draw `SAMPLED_PIXELS` in total, equally many per photo, or all of a photo's usable pixels if it has fewer.
+
+        Raises:
+            UserError: masks hide all photos.
+        """
+        photos = [photo for photo in photos if photo.used is None or photo.used.any()]
+        if not photos:
+            raise UserError(
+                "no pixels of the photos are left to compare",
+                "check their masks: white pixels are used, black ones are ignored",
+            )
         generator = np.random.default_rng(seed)
         wanted = -(-SAMPLED_PIXELS // len(photos))
         chosen = []
