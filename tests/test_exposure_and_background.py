@@ -31,8 +31,8 @@ from nerfcli.training.fitting import Fitting
 from nerfcli.training.loop import Progress, train
 from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.preparation import EarlierDecisions, prepare
-from nerfcli.training.runs.components import Components
-from nerfcli.training.runs.run import Run
+from nerfcli.training.runs.components import Components, Selection
+from nerfcli.training.runs.run import Run, RunConfig
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.step import light_from_beyond
 
@@ -156,7 +156,8 @@ def test_a_resumed_training_keeps_the_exposures_that_auto_has_fixed(capture, tmp
     monkeypatch.setattr("nerfcli.training.evidence.matched_log_gains", lambda photos, dense: found)
     settings, notes = replace(SHORT, model="auto", components=Components()), []
     first = prepare(capture, SHORT, run=tmp_path, notify=lambda text: None)
-    begun = EarlierDecisions(first.extent, Components(exposure="matched"), None)
+    selection = Selection(Components(exposure="matched"), ())
+    begun = EarlierDecisions(first.extent, RunConfig(settings=settings, selection=selection))
     inputs = prepare(capture, settings, run=tmp_path, begun=begun, notify=notes.append)
     assert inputs.log_gains is not None
     np.testing.assert_array_equal(inputs.log_gains.numpy(), found)

@@ -41,6 +41,7 @@ from nerfcli.render.pictures import DepthRequest, render_picture
 from nerfcli.training import loop, sentinel
 from nerfcli.training.loop import Progress, train
 from nerfcli.training.pool import PixelBatch, PixelPool
+from nerfcli.training.runs.components import Components, choose
 from nerfcli.training.runs.files import LogEntry, append_log, read_log
 from nerfcli.training.runs.run import Run, read_config
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
@@ -305,6 +306,23 @@ def test_resume_goes_on_to_a_larger_total(views, tmp_path):
     assert second[0].seconds > read_log(tmp_path / "run")[0]["seconds"]  # the clock goes on too
     assert read_config(tmp_path / "run").settings.steps == 5
     assert fit(views, tmp_path / "run", replace(FEW, steps=5), resume=True) == []
+
+
+def test_a_resumed_training_keeps_its_components_seed_and_size_of_photos(views, tmp_path):
+    """They need not be given again; others than before are refused, or would be in the description alone."""
+    chosen = {"components": Components(distortion=0.01, exposure="learned"), "fixed": ("distortion", "exposure")}
+    settings = replace(FEW, steps=6, downscale=4, seed=3, **chosen)
+    fit(views, tmp_path / "straight", settings)
+    with pytest.raises(KeyboardInterrupt):
+        fit(views, tmp_path / "parts", settings, on_progress=stop_at(3))
+    for wanted in ("background=sphere", "distortion=0.05"):
+        others = choose(settings.components, included=(wanted,), excluded=())
+        changed = replace(settings, components=others, fixed=(wanted.partition("=")[0],))
+        with pytest.raises(UserError, match=rf"was trained with .*, not {wanted}"):
+            fit(views, tmp_path / "parts", changed, resume=True)
+    fit(views, tmp_path / "parts", replace(FEW, steps=6), resume=True)
+    assert weights(tmp_path / "parts") == weights(tmp_path / "straight")
+    assert read_config(tmp_path / "parts") == read_config(tmp_path / "straight")
 
 
 def test_what_has_learned_goes_on_learning_in_a_larger_budget(views, tmp_path):

@@ -49,6 +49,8 @@ from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.sentinel import that_must_be_finite
 
 STATE_FORMAT = "nerfcli training 2"
+# Advice where a training cannot be resumed as requested.
+ANEW = "train into a new folder with -o, or again with --overwrite"
 # Photos without alpha fill the frame; behind the field is black, and little of it shows through.
 OPAQUE_BACKGROUND = (0.0, 0.0, 0.0)
 ALPHA_BACKGROUND = (1.0, 1.0, 1.0)
@@ -187,37 +189,29 @@ def read_checkpoint(
     """Return the last checkpoint of a run, for `restore`, and the decisions made before it.
 
     Raises:
-        UserError: there is none, another version wrote it, or it has another contraction than requested.
+        UserError: there is none, another version wrote it, or it has another contraction or component than requested.
     """
     tensors, description = load_tensors(run / STATE, settings.device)
     if description.get("format") != STATE_FORMAT:
         raise UserError(f"{run / STATE} was written by another version of nerfcli", "train again with --overwrite")
-    extent = Extent.from_json(description["extent"])
+    extent, config = Extent.from_json(description["extent"]), read_config(run)
     if settings.contraction not in (None, extent.contraction):
-        raise UserError(
-            f"{run} was trained with --contraction {extent.contraction}, not {settings.contraction}",
-            "train into a new folder with -o, or again with --overwrite",
-        )
-    config = read_config(run)
-    return (tensors, description), EarlierDecisions(extent, config.components, config.selection)
+        raise UserError(f"{run} was trained with --contraction {extent.contraction}, not {settings.contraction}", ANEW)
+    for name in settings.fixed:
+        had, wanted = (str(getattr(one, name)).lower() for one in (config.components, settings.components))
+        if had != wanted:
+            raise UserError(f"{run} was trained with {name}={had}, not {name}={wanted}", ANEW)
+    return (tensors, description), EarlierDecisions(extent, config)
 
 
 def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> Totals:
     """Restore `fitting` from the run's last checkpoint.
 
     Raises:
-        UserError: the checkpoint has another field or other components, or numbers that are not finite.
+        UserError: the checkpoint has another field, or numbers that are not finite.
     """
     if settings_from_json(description["field"]) != fitting.field.settings:
-        raise UserError(
-            f"{run} was trained with another field ({description['field']})",
-            "train into a new folder with -o, or again with --overwrite",
-        )
-    if missing := [name for name in fitting.appearance.state_dict() if f"parts.{name}" not in tensors]:
-        raise UserError(
-            f"{run} was trained without a component that --with now enables ({missing[0]})",
-            "train into a new folder with -o, or again with --overwrite",
-        )
+        raise UserError(f"{run} was trained with another field ({description['field']})", ANEW)
     refuse_non_finite(that_must_be_finite(tensors), run / STATE)
     fitting.restore(tensors, description)
     totals = dict(description["totals"])

@@ -115,10 +115,10 @@ def train(
     use_threads(settings.threads)
     kernels.prepare(notify, settings.device)
     saved, begun = distributed.from_first(lambda: read_checkpoint(run, settings) if resume else (None, None))
-    # A training resumed with a larger budget keeps its number of rows.
-    rows = settings.log2_rows or (saved[1]["field"].get("log2_rows") if saved is not None else None)
+    if begun is not None:
+        settings = begun.continued(settings)
     with_all_threads = replace(settings, threads=sum(distributed.gathered(settings.threads)))
-    settings = replace(settings, log2_rows=rows or with_all_threads.chosen_log2_rows)
+    settings = replace(settings, log2_rows=with_all_threads.chosen_log2_rows)
     inputs = prepare(scene, settings, run=run, memory_bytes=memory_bytes, begun=begun, notify=notify)
     fitting = Fitting(inputs)
     notify(f"field: {fitting.field.settings.size_text}; {field_bytes(fitting.field) / 1e6:.2f} MB")

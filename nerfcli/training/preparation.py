@@ -25,6 +25,7 @@ from nerfcli.training.extent import Extent, choose_extent, lacks_depth
 from nerfcli.training.fitting import TrainingInputs
 from nerfcli.training.pool import PixelPool, PointRays, load_album
 from nerfcli.training.runs.components import Components, Selection
+from nerfcli.training.runs.run import RunConfig
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.training.schedule import SEARCH_FRACTION, Budget
 from nerfcli.training.selection import Facts, select, with_evidence, with_known_cameras
@@ -34,11 +35,26 @@ from nerfcli.training.trials import Trials
 
 @dataclass(frozen=True)
 class EarlierDecisions:
-    """Decisions of an interrupted training."""
+    """Decisions of an interrupted training: the extent of its field, and its configuration."""
 
     extent: Extent
-    components: Components
-    selection: Selection | None
+    config: RunConfig
+
+    def continued(self, settings: TrainSettings) -> TrainSettings:
+        """Return settings with what a training keeps: its seed, components and, unless given, rows and size of photos.
+
+        A larger budget alone would choose more rows.
+        """
+        before = self.config.settings
+        return replace(
+            settings,
+            seed=before.seed,
+            components=before.components,
+            model=before.model,
+            fixed=before.fixed,
+            log2_rows=settings.log2_rows or before.log2_rows,
+            downscale=settings.downscale or before.downscale,
+        )
 
 
 def prepare(
@@ -77,7 +93,7 @@ def prepare(
     photos = TrainingPhotos(scene, album, shared)
 
     if begun is not None:
-        settings = replace(settings, components=begun.components)
+        settings = replace(settings, components=begun.config.components)
     extent = distributed.from_first(lambda: _extent(photos, settings, notify=notify) if begun is None else begun.extent)
     pool = PixelPool(album.photos, extent.training_from_scene, device, colours=album.colours, storage=storage)
     camera = pool.cameras[0]
@@ -106,7 +122,7 @@ def prepare(
     log_exposure, log_gains = _exposures(photos, settings.components, evidence, selection, notify=notify)
     return replace(
         inputs,
-        selection=selection if begun is None else begun.selection,
+        selection=selection if begun is None else begun.config.selection,
         log_exposure=log_exposure,
         log_gains=log_gains,
         log_focal=log_focal,
