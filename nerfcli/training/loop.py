@@ -26,7 +26,7 @@ from nerfcli.training.checkpoints import (
 )
 from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.preparation import prepare
-from nerfcli.training.runs.files import FIELD, LOG, STATE, LogEntry, append_log, cut_log
+from nerfcli.training.runs.files import FIELD, LOG, METRICS, STATE, LogEntry, append_log, cut_log
 from nerfcli.training.runs.run import RunConfig, write_config
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import WAYPOINTS, Budget
@@ -168,7 +168,7 @@ def _clear(run: Path) -> None:
     """Create the run folder, and remove files of an earlier training from it."""
     try:
         run.mkdir(parents=True, exist_ok=True)
-        for old in (run / STATE, run / FIELD, run / LOG, *run.glob(FAILURES)):
+        for old in (*(run / name for name in (STATE, FIELD, LOG, METRICS)), *run.glob(FAILURES)):
             old.unlink(missing_ok=True)
         remove_left_out(run)
     except OSError as error:

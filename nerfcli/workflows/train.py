@@ -28,7 +28,7 @@ from nerfcli.output import Output
 from nerfcli.training import loop
 from nerfcli.training.loop import OCCLUDERS
 from nerfcli.training.runs.components import choose
-from nerfcli.training.runs.files import CONFIG, LOCK, METRICS, STATE
+from nerfcli.training.runs.files import CONFIG, LOCK, STATE
 from nerfcli.training.runs.run import Run, split_hash
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.training.schedule import WAYPOINTS, Schedule, StepPlan
@@ -160,8 +160,6 @@ def _train(task: _Task, reporter: Reporter, again: str) -> None:
         reporter.progress(state.fraction, f"step {state.step}  loss {state.loss:.4f}  {speed}{left}")
 
     clear_leftovers(run)
-    if task.overwrite:
-        (run / METRICS).unlink(missing_ok=True)  # they belong to the field that is replaced
     distributed.from_first(lambda: True)
     reporter.progress(0.0, "")
     try:
