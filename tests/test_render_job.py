@@ -268,6 +268,22 @@ def test_other_videos_and_levels_of_a_finished_folder_are_made_without_rendering
     assert not list(tmp_path.glob(".views*"))
 
 
+def test_videos_that_others_were_to_replace_are_made_again(model, tmp_path, rendered, monkeypatch):
+    """Regression: after Ctrl-C, the command for those that had been there found the folder complete."""
+
+    def interrupted(*given: Any, **options: Any) -> None:
+        raise KeyboardInterrupt
+
+    folder, done = shutil.copytree(rendered, tmp_path / "views"), list[float]()
+    with monkeypatch.context() as patched:
+        patched.setattr("nerfcli.render.presentation.write_video", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            render(model, job_of(video=VideoSettings(("mp4",))), folder)
+    render(model, job_of(), folder, overwrite=False, on_frames=done.append)
+    assert done == [4]  # all at once, as they exist
+    assert contents(folder) == contents(rendered)
+
+
 def test_replacing_needs_overwrite_and_adding_does_not(model, tmp_path):
     folder = tmp_path / "views"
     render(model, job_of(video=None), folder, overwrite=False)

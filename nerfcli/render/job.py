@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from nerfcli.atomic import read_json
+from nerfcli.atomic import read_json, write_json
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.output import Output
@@ -229,7 +229,11 @@ class RenderJob:
         return [folder / f"{output}.{form}" for form in video.formats for output in self.settings.outputs]
 
     def remove_other_presentation(self, folder: Path) -> None:
-        """Remove videos and 16-bit levels of a finished folder that are not wanted."""
+        """Remove videos and 16-bit levels of a finished folder that are not wanted.
+
+        The description first: until others are complete, it names none.
+        """
+        write_json(folder / RENDERS, {**_made(folder), **dict.fromkeys(self.settings.of_presentation())})
         if not self.settings.in_levels:
             shutil.rmtree(folder / LEVELS_FOLDER, ignore_errors=True)
         wanted = self.results(folder) if self.settings.video else []
