@@ -236,7 +236,7 @@ def test_render_writes_coverage_and_parallax_and_removes_depth(run, tmp_path):
     assert "parallax, in degrees: the largest angle between the rays of two training photos" in text
     assert "min views: 4" in nerfcli("info", next((tmp_path / "views").rglob("*.exr"))).stdout
     again = nerfcli(*common, "--outputs", "depth,coverage,parallax", "-o", tmp_path / "views")
-    assert "min_views 4, not None" in error_of(again)[0]
+    assert "min_views 4, not 0" in error_of(again)[0]
 
 
 def test_limits_need_depth(run):

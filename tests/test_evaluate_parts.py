@@ -112,7 +112,6 @@ def test_the_ledger_says_what_each_way_to_poses_has_seen():
     assert (others["poses"], others["intrinsics"], others["points"]) == (None, None, None)
     foreign = seen({"history": {"from": "blender"}})
     assert (foreign["poses"], foreign["training"]) == (None, False)
-    assert seen({})["poses"] is None
     chosen = Selection(Components(exposure="matched"), (), 0.0)
     (exposure,) = [entry for entry in leak_ledger(RunConfig(selection=chosen)) if entry.stage == "exposure"]
     assert "training photos share" in exposure.how

@@ -348,7 +348,7 @@ def test_a_run_keeps_background_and_exposures_and_goes_on_bit_for_bit(capture, t
     assert isinstance(model.background, SphereBackground)
     assert torch.equal(model.background.logits, states[0]["parts.background.logits"])
     reference = mean_log_exposure(log_exposures(capture.train_frames))
-    assert Run(tmp_path / "parts").exposures.log_exposure == pytest.approx(reference)
+    assert Run(tmp_path / "parts").cameras.exposures.log_exposure == pytest.approx(reference)
 
 
 def test_empty_space_shows_the_background_by_direction_whatever_the_tile(capture, tmp_path, monkeypatch):

@@ -15,7 +15,6 @@ from nerfcli import kernels
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings, fourier_features
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
@@ -411,18 +410,6 @@ def test_every_kind_comes_back_bit_for_bit(field, tmp_path):
     assert type(loaded) is type(field)
     for name, value in field.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], value), name
-
-
-def test_a_field_from_before_there_were_kinds_is_a_hash_grid(tmp_path):
-    torch.manual_seed(0)
-    field = fresh_field(SMALL["hash"])
-    save_model(tmp_path / "new.safetensors", model_of(field))
-    tensors, description = load_tensors(tmp_path / "new.safetensors", "cpu")
-    del description["field"]["kind"], description["field"]["view_degree"]
-    save_tensors(tmp_path / "old.safetensors", tensors, description)
-    loaded = load_model(tmp_path / "old.safetensors", "cpu").field
-    assert loaded.settings == field.settings
-    assert torch.equal(density_of(loaded, places(7)), density_of(field, places(7)))
 
 
 def test_a_kind_of_a_later_version_is_reported():

@@ -104,16 +104,16 @@ def test_only_crossed_cells_without_content_are_closed(models):
     assert fine.open_cells[behind].float().mean() >= fine.open_cells[seen].float().mean()
 
 
-def test_fine_cells_are_in_the_file_and_older_files_have_none(models, tmp_path):
+def test_fine_cells_are_in_the_file_if_there_are_any(models, tmp_path):
     coarse, fine, frames = models
     save_model(tmp_path / "fine", fine)
     save_model(tmp_path / "coarse", coarse)
-    again, older = load_model(tmp_path / "fine", "cpu"), load_model(tmp_path / "coarse", "cpu")
-    assert older.fine is None
+    again, without = load_model(tmp_path / "fine", "cpu"), load_model(tmp_path / "coarse", "cpu")
+    assert without.fine is None
     assert again.fine is not None
     assert torch.equal(again.fine, fine.open_cells)
     assert (tmp_path / "fine").stat().st_size - (tmp_path / "coarse").stat().st_size < 1.01 * SIDE**3 / 8 + 1000
     frame = frames[0]
-    pictures = [render_picture(model, frame, background=BLACK).rgb for model in (fine, again, coarse, older)]
+    pictures = [render_picture(model, frame, background=BLACK).rgb for model in (fine, again, coarse, without)]
     np.testing.assert_array_equal(pictures[0], pictures[1])
     np.testing.assert_array_equal(pictures[2], pictures[3])

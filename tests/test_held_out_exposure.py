@@ -1,8 +1,7 @@
 """Exposures of held-out photos from neighbouring photos: closed forms, and storing them in a run and using them."""
 
-import json
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from PIL import ExifTags, Image
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.photos.held_out_exposure import (
     PhotoExposures,
     exif_slope,
@@ -147,7 +145,7 @@ def trained(scene: Capture, run: Path, *, exposure: str) -> PhotoExposures:
         threads=1,
     )
     train(scene, run, settings, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
-    return Run(run).exposures
+    return Run(run).cameras.exposures
 
 
 def test_training_estimates_exposures_of_held_out_photos_without_opening_them(tmp_path: Path):
@@ -224,24 +222,6 @@ def test_exif_of_a_held_out_photo_takes_precedence_over_its_neighbours(monkeypat
         assert log_gains_of(frames, unused).tolist()[0] == [9.0] * 3
         assert gain_sources(frames, unused)[0] == "training photos around"
     assert gain_sources(frames, PhotoExposures()) == ["none"] * 3
-
-
-def test_exposures_of_a_run_of_an_earlier_version_are_read_from_the_file_of_its_field(finished: Path):
-    """Its description had these four keys, and cameras.json none of them."""
-    known = {
-        "log_exposure": -1.5,
-        "exif_slope": 0.7,
-        "exposures": {"a": [0.1, 0.2, 0.3]},
-        "beyond_exif": {"b": [0.0] * 3},
-    }
-    tensors, description = load_tensors(finished / "field.safetensors", "cpu")
-    assert not known.keys() & description.keys()
-    save_tensors(finished / "field.safetensors", tensors, description | known)
-    assert Run(finished).exposures == PhotoExposures()
-    cameras = json.loads((finished / "cameras.json").read_text())
-    del cameras["exposures"], cameras["blake2b"]
-    (finished / "cameras.json").write_text(json.dumps(cameras))
-    assert asdict(Run(finished).exposures) == known
 
 
 def log_ratio(one: int, other: int) -> float:

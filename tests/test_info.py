@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import tifffile
-from commands import error_of, nerfcli
+from commands import nerfcli
 from depth_maps import ALL, FULL_META, META, plain_depth
 from every_format import WITH_PHOTOS
 from PIL import Image
@@ -240,25 +240,3 @@ def test_headers_of_arrays_that_python_cannot_parse_are_damage(tmp_path):
     np.save(path, np.zeros((2, 3)))
     path.write_bytes(path.read_bytes().replace(b"}", b"("))
     assert f"{path} is damaged or does not contain an array" in info(path).stderr.splitlines()[0]
-
-
-@pytest.mark.parametrize(
-    ("name", "usual", "other"),
-    [
-        *(("photo_fraction", 1.0, 0.8), ("random_start", 0.0, 0.1), ("blocks", 0, 4), ("width", 32, 64)),
-        *(("overlap", False, True), ("entropy", 0.0, 0.01), ("pixels", "anywhere", "error"), ("movers", False, True)),
-    ],
-)
-def test_a_run_that_was_trained_with_what_was_removed_is_refused_and_any_other_is_read(finished, name, usual, other):
-    config = finished / "config.json"
-    content = json.loads(config.read_text())
-    content.pop("sha256", None)
-    is_component = name in ("overlap", "entropy", "pixels", "movers")
-    for value in (usual, other):
-        (content["settings"]["components"] if is_component else content["settings"])[name] = value
-        config.write_text(json.dumps(content))
-        result = nerfcli("info", finished)
-        assert result.exit_code == (0 if value == usual else 3), result.stderr
-    error, hint = error_of(result)
-    assert f"its training had {name}={str(other).lower()}" in error
-    assert "train again" in hint

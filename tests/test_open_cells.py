@@ -227,15 +227,3 @@ def test_a_restored_state_goes_on_as_the_saved_one():
         for step in (1, REFRESH_EVERY):
             assert torch.equal(first.at(step), second.at(step))
     assert not second.at(1)[0, 0, 1]
-
-
-def test_a_checkpoint_without_fine_cells_is_continued_with_all_of_them_open():
-    cells = cells_of(Slab())
-    refresh(cells, REFRESH_EVERY)
-    old = {name: tensor for name, tensor in cells.state().items() if not name.startswith("fine_")}
-    restored = cells_of(Slab())
-    restored.restore(old)
-    assert restored.at(1).all()
-    assert torch.equal(restored.coarse, cells.coarse)
-    refresh(restored, 2 * REFRESH_EVERY)
-    assert torch.equal(restored.at(1), cells.at(1))

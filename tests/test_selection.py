@@ -238,7 +238,7 @@ def test_what_gains_is_in_the_model_what_does_not_is_not_and_seeds_are_paired():
     }
     assert {seed for _, seed, _ in scripted.requested} == {0, 1}
     assert {steps for _, _, steps in scripted.requested} == {125}  # half of the longest start
-    assert Selection.from_json(chosen.to_json(), wanted=Components()).decisions == chosen.decisions
+    assert Selection.from_json(chosen.to_json()).decisions == chosen.decisions
 
 
 POINTED = replace(FITTED, points=7)

@@ -64,10 +64,8 @@ def _exposure(config: RunConfig) -> Entry:
     return Entry("exposure", False, how.get(chosen, str(chosen)))
 
 
-def _cameras(history: Mapping[str, Any] | None, kind: str, holdout: str | None) -> list[Entry]:
+def _cameras(history: Mapping[str, Any], kind: str, holdout: str | None) -> list[Entry]:
     stages = ("poses", "intrinsics", "points")
-    if history is None:
-        return [Entry(stage, None, "this run was trained before nerfcli recorded this") for stage in stages]
     if history.get("command") != "poses":
         source = history.get("from", kind)
         return [Entry(stage, None, f"the cameras came with the capture ({source})") for stage in stages]

@@ -128,9 +128,8 @@ def held_out_photos(run: Run, frames: Sequence[Frame]) -> list[HeldOutPhoto]:
     """
     threads, masks = torch.get_num_threads(), run.components.masks
     photos = load_photos(frames, factor=run.config.downscale, threads=threads, masks=masks)
-    exposed = zip(
-        photos, log_gains_of(frames, run.exposures).tolist(), gain_sources(frames, run.exposures), strict=True
-    )
+    known = run.cameras.exposures
+    exposed = zip(photos, log_gains_of(frames, known).tolist(), gain_sources(frames, known), strict=True)
     return [
         HeldOutPhoto(photo.frame, photo.pixels, photo.used, log_gains=tuple(gains), gains_from=source)
         for photo, gains, source in exposed

@@ -197,7 +197,7 @@ class RunMetrics:
 
     @staticmethod
     def from_json(content: Mapping[str, Any], path: Path) -> "RunMetrics":
-        """Return the metrics from plain values, also those of earlier versions.
+        """Return the metrics from plain values.
 
         Raises:
             UserError: a number is missing, or not what it should be.

@@ -54,8 +54,7 @@ def parse_requirements(text: str) -> tuple[Requirement, ...]:
 
 def known_numbers(metrics: RunMetrics, config: RunConfig) -> dict[str, float | None]:
     """Return the numbers of a run that requirements can refer to."""
-    history = config.history or {}
-    placed, photos = history.get("registered"), history.get("total")
+    placed, photos = config.history.get("registered"), config.history.get("total")
     return {
         **metrics.mean.to_json(),
         "registered": placed / photos if placed is not None and photos else None,

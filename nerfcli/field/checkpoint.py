@@ -13,10 +13,9 @@ from torch import Tensor, uint8
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import NON_FINITE, UserError
 
-# Entries of the file's metadata. The format has no checksum: a bit that flips on disk would silently change the field.
+# Entry of the file's metadata. The format has no checksum: a bit that flips on disk would silently change the field.
 # Digest and description share an entry, as safetensors writes several in any order, and equal fields give equal files.
 _ENTRY = "description"
-_DIGEST = "blake2b"  # a separate entry in files of earlier versions; those of the first versions have none
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
@@ -62,14 +61,10 @@ def tensors_of(content: bytes, path: Path, device: str) -> tuple[dict[str, Tenso
     try:
         tensors = load(content)
         (length,) = struct.unpack_from("<Q", content)
-        metadata = json.loads(content[8 : 8 + length]).get("__metadata__") or {}
-        entry = metadata[_ENTRY]
-        stored = json.loads(entry)
-        sealed = isinstance(stored, list)
-        digest, description = stored if sealed else (metadata.get(_DIGEST), stored)
-    except (SafetensorError, KeyError, ValueError) as error:
+        digest, description = json.loads(json.loads(content[8 : 8 + length])["__metadata__"][_ENTRY])
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
         raise _unreadable(path, error) from error
-    if (sealed or digest is not None) and digest != _digest(tensors, json.dumps(description) if sealed else entry):
+    if digest != _digest(tensors, json.dumps(description)):
         raise UserError(
             f"{path} is damaged: its content has changed since it was written",
             "train again with --overwrite, or restore the file; check the disk",

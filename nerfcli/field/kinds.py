@@ -33,13 +33,13 @@ def closing_steps(settings: FieldSettings) -> int:
 
 
 def settings_from_json(content: dict[str, Any]) -> FieldSettings:
-    """Read settings from `FieldSettings.to_json`; without a kind, they are those of a hash grid.
+    """Read settings from `FieldSettings.to_json`.
 
     Raises:
         UserError: the kind is not known here.
     """
-    sizes = {name: value for name, value in content.items() if name != "kind"}
-    kind = content.get("kind", HashFieldSettings.kind)
+    sizes = dict(content)
+    kind = sizes.pop("kind")
     for settings in _FIELDS:
         if settings.kind == kind:
             return settings(**sizes)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Self
 
 import numpy as np
 
@@ -30,11 +29,6 @@ class PhotoExposures:
     exif_slope: float = 1.0
     exposures: Mapping[str, Sequence[float]] = field(default_factory=dict)
     beyond_exif: Mapping[str, Sequence[float]] = field(default_factory=dict)
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Read the fields from a JSON object, which may lack some and hold others."""
-        return cls(**{name: content[name] for name in cls.__dataclass_fields__ if name in content})
 
 
 def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray) -> np.ndarray:

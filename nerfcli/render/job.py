@@ -105,11 +105,6 @@ class RenderSettings:
         """Return the settings that determine the rendered numbers and their files, as plain values."""
         settings = asdict(self)
         del settings["video"]
-        for name in ("min_views", "min_parallax_deg"):
-            if not settings["depth"][name]:  # as in folders that were written before these settings existed
-                del settings["depth"][name]
-        if not self.check_accuracy:
-            del settings["check_accuracy"]
         return settings | {"outputs": list(self.outputs), "formats": list(self.float_formats)}
 
     def of_presentation(self) -> dict[str, Any]:

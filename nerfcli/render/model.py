@@ -21,8 +21,6 @@ from nerfcli.render.pictures import render_picture
 from nerfcli.render.trained_field import Marching, TrainedField
 
 FORMAT = "nerfcli field 2"
-# Format without a choice of contractions; still read.
-FORMAT_1 = "nerfcli field 1"
 BACKGROUND, FINE = "background.logits", "fine"
 
 
@@ -64,9 +62,6 @@ def load_model(path: Path, device: str) -> Model:
     """
     content = read_checkpoint(path)
     tensors, description = tensors_of(content, path, device)
-    if description.get("format") == FORMAT_1:
-        description["format"] = FORMAT
-        description["field"]["contraction"] = "l2" if description["field"].pop("unbounded") else "none"
     if description.get("format") != FORMAT:
         raise UserError(
             f"{path} is of format {description.get('format')!r}, expected {FORMAT!r}",
@@ -87,7 +82,7 @@ def load_model(path: Path, device: str) -> Model:
         background=background,
         training_from_scene=Similarity.from_json(description["training_from_scene"]),
         unit=description["unit"],
-        unit_source=description.get("unit_source"),
+        unit_source=description["unit_source"],
         sha256=hashlib.sha256(content).hexdigest(),
         fine=fine,
     )

@@ -214,9 +214,7 @@ def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description
         raise UserError(f"{run} was trained with another field ({description['field']})", ANEW)
     refuse_non_finite(that_must_be_finite(tensors), run / STATE)
     fitting.restore(tensors, description)
-    totals = dict(description["totals"])
-    prepared = totals.pop("searched", 0.0)  # the name in earlier versions
-    return Totals(**{"prepared": prepared, **totals})
+    return Totals(**description["totals"])
 
 
 WAYPOINTS_FOLDER = "waypoints"
@@ -263,7 +261,8 @@ def measure_waypoints(
         measured = {}
         for step in steps:
             waypoint = Run(_waypoint(run, step))
-            measured[step] = pixels.psnr(waypoint.model(device), log_gains=log_gains_of(held_out, waypoint.exposures))
+            log_gains = log_gains_of(held_out, waypoint.cameras.exposures)
+            measured[step] = pixels.psnr(waypoint.model(device), log_gains=log_gains)
         add_to_log(run, {step: {"heldout_psnr": psnr} for step, psnr in measured.items()})
         curve = ", ".join(f"{psnr:.2f} dB at step {step}" for step, psnr in measured.items())
         notify(f"PSNR on a sample of held-out pixels: {curve}")

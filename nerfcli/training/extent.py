@@ -232,8 +232,8 @@ class Extent:
     def from_json(content: dict[str, Any]) -> "Extent":
         """Return the extent that `to_json` described."""
         similarity = Similarity.from_json(content["training_from_scene"])
-        marching, parallax = Marching(**content["marching"]), content.get("parallax", 1.0)
-        return Extent(content["contraction"], similarity, marching, content.get("reach"), parallax)
+        marching = Marching(**content["marching"])
+        return Extent(content["contraction"], similarity, marching, content["reach"], content["parallax"])
 
     def before(self, background: str, *, sky_known: bool) -> "Extent":
         """Return the extent for a kind of background, see `Components`: the field ends where a learned one begins.

@@ -282,5 +282,5 @@ class Fitting:
         self.step = description["step"]
         self.samples_per_ray = description["samples_per_ray"]
         self.rate_factor, self.rollbacks = description["rate_factor"], description["rollbacks"]
-        self.furthest = description.get("furthest", 1.0)  # earlier versions learned all detail from the start
+        self.furthest = description["furthest"]
         self.in_step = False

@@ -231,6 +231,6 @@ class OpenCells:
         self._occupancy.restore(tensors)
         # Not recomputed: the threshold changes between two refreshes, the open cells do not.
         self.coarse = tensors["occupied"]
-        if self.cell_depths is not None and "fine_depth" in tensors:  # earlier checkpoints have no fine cells
+        if self.cell_depths is not None:
             self._depths, self.cell_depths = tensors["fine_depth"], tensors["fine_visits"]
             self._fine = tensors["fine_occupied"]

@@ -240,7 +240,7 @@ class _SavedBatch(PixelPool):
     def __init__(self, tensors: dict[str, Tensor], cameras: Sequence[dict[str, Any]]):
         self.colours, self.first_pixel = tensors["batch.colours"], tensors["batch.first_pixel"]
         self.cones = tensors["batch.cones"]
-        self.poses = tensors.get("batch.poses", torch.zeros(0, 4, 4))  # earlier versions refined no cameras
+        self.poses = tensors["batch.poses"]
         self.cameras = tuple(Camera.from_json(camera) for camera in cameras)
         self._drawn = PixelBatch(**{name: tensors[f"batch.{name}"] for name in PixelBatch._fields})
         self._after_draw = tensors["batch.after_draw"]
@@ -269,9 +269,9 @@ def replay(path: Path) -> tuple[dict[str, Any], BadTensor | None]:
     settings = replace(TrainSettings.from_json(description["settings"]), device="cpu")
     use_threads(settings.threads)
     size = settings_from_json(description["state"]["field"])
-    marching, parallax = Marching(**description["marching"]), description.get("parallax", 1.0)
-    extent = Extent(size.contraction, Similarity.identity(), marching, parallax=parallax)
-    fitting = Fitting(TrainingInputs(settings, extent, _SavedBatch(tensors, description.get("cameras", ()))), size=size)
+    marching = Marching(**description["marching"])
+    extent = Extent(size.contraction, Similarity.identity(), marching, parallax=description["parallax"])
+    fitting = Fitting(TrainingInputs(settings, extent, _SavedBatch(tensors, description["cameras"])), size=size)
     fitting.restore({name: t for name, t in tensors.items() if not name.startswith("batch.")}, description["state"])
     return description, _watched_step(fitting, description["share"])[1]
 

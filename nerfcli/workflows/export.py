@@ -110,7 +110,7 @@ def _export_page(run: Run, model: Model, path: Path, *, settings: SurfaceSetting
     numbers = PageNumbers.of(packed, proof, seen_cells(model, seen))
     text_bytes = len(numbers.elements)
     photos = page_photos(
-        run.exposures,
+        run.cameras.exposures,
         cameras.train,
         cameras.test,
         room_bytes=PAGE_BYTES - text_bytes - 150_000,

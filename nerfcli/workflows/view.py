@@ -101,7 +101,7 @@ class RunData:
     def page(self) -> str:
         version, model = self.model()
         run, frames = Run(self._path), self._frames()
-        photos = fetched_photos(run.exposures, run.cameras.train, run.cameras.test)
+        photos = fetched_photos(run.cameras.exposures, run.cameras.train, run.cameras.test)
         scene = scene_of(model, run=self._path, frames=frames, photos=photos, box=_box(model, frames))
         return live_page_html(scene, version=version, refusal=self._refusal(), far=model.marching.far)
 

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +26,11 @@ _GIVEN, _EXPOSURES, _WRITTEN_AT = "given", "exposures", "written_at"
 
 @dataclass(frozen=True)
 class RunCameras:
-    """The frames that were trained on, those that were held out, and what is known of their exposures.
-
-    Args:
-        exposures: None in files of earlier versions, which kept them in the file of the field.
-    """
+    """The frames that were trained on, those that were held out, and what is known of their exposures."""
 
     train: tuple[Frame, ...]
     test: tuple[Frame, ...]
-    exposures: PhotoExposures | None = None
+    exposures: PhotoExposures = field(default_factory=PhotoExposures)
 
 
 def write_cameras(
@@ -110,7 +106,7 @@ def _read_frames(path: Path, *, given: bool) -> RunCameras:
             )
             for name in ("train", "test")
         )
-        exposures = PhotoExposures.from_json(content[_EXPOSURES]) if _EXPOSURES in content else None
+        exposures = PhotoExposures(**content[_EXPOSURES])
     except FileNotFoundError as error:
         raise UserError(
             f"{run} is not a run folder: it has no {CAMERAS}", "give a run folder written by nerfcli train"

@@ -24,8 +24,6 @@ CAMERAS = ("fixed", "poses", "focal", "all")
 POINT_WEIGHT = 0.1
 # Meaning of black in a mask: unknown, or empty space.
 MASKS = ("ignore", "empty")
-# Components of earlier versions, each with the value that switched it off.
-_FORMER = {"overlap": False, "entropy": 0.0, "pixels": "anywhere", "movers": False}
 # Spherical harmonics up to this degree: 16 of them.
 MOST_DEGREES = 3
 
@@ -73,32 +71,6 @@ class Components:
     def distance_weight(self) -> float:
         """Weight of known distances: those of a sensor count as much without points as with them by default."""
         return self.points or (POINT_WEIGHT if self.sensor else 0.0)
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> "Components":
-        """Read the components of a run of this or an earlier version; missing ones have their defaults.
-
-        Raises:
-            UserError: see `without_former`.
-            TypeError: a component is unknown.
-        """
-        return cls(**without_former(content, _FORMER))
-
-
-def without_former(content: Mapping[str, Any], former: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings of a run without those that only earlier versions had.
-
-    Args:
-        former: names of these, each with the only value that can still be read.
-
-    Raises:
-        UserError: one has another value.
-    """
-    for name, value in former.items():
-        if content.get(name, value) != value:
-            had = f"{name}={str(content[name]).lower()}"
-            raise UserError(f"its training had {had}, unknown to this version", "use the version that trained it")
-    return {name: value for name, value in content.items() if name not in former}
 
 
 @dataclass(frozen=True)
@@ -214,12 +186,6 @@ class Decision:
     why: str = ""
     seen: str = ""
 
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> "Decision":
-        """Read the entries of a decision; those that earlier versions did not write are None or ""."""
-        entries: dict[str, Any] = {entry.name: content.get(entry.name) for entry in fields(cls)}
-        return cls(**{**entries, "seen": content.get("seen", "")})
-
     @property
     def reason(self) -> str:
         """What was seen, and what else decided."""
@@ -273,11 +239,7 @@ class Selection:
         }
 
     @classmethod
-    def from_json(cls, content: Mapping[str, Any], *, wanted: Components) -> "Selection":
-        """Read the content that `to_json` returned, without exposures; `wanted` are the components if it has none."""
-        chosen = content.get("components")
-        return cls(
-            components=Components.from_json(chosen) if chosen else wanted,
-            decisions=tuple(Decision.from_json(one) for one in content.get("decisions", ())),
-            seconds=content.get("seconds", 0.0),
-        )
+    def from_json(cls, content: Mapping[str, Any]) -> "Selection":
+        """Read the content that `to_json` returned, without exposures."""
+        decisions = tuple(Decision(**one) for one in content["decisions"])
+        return cls(Components(**content["components"]), decisions, content["seconds"])

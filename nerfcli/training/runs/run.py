@@ -17,7 +17,6 @@ from nerfcli.captures.loading import fingerprint
 from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.errors import UserError, in_shell
 from nerfcli.field.checkpoint import load_tensors
-from nerfcli.photos.held_out_exposure import PhotoExposures
 from nerfcli.render.model import Model, load_model
 from nerfcli.training.runs.components import Components, Decision, Selection
 from nerfcli.training.runs.files import CONFIG, FIELD, METRICS, STATE, LogEntry, TrainingSummary, read_log
@@ -27,7 +26,7 @@ from nerfcli.version import __version__
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Source and settings of a run; entries missing in files of earlier versions have their defaults.
+    """Source and settings of a run.
 
     Args:
         scene: the folder of the scene, absolute or relative to the working directory of the training.
@@ -36,7 +35,7 @@ class RunConfig:
         scene_fingerprint: see `captures.loading.fingerprint`.
         split_sha256: see `split_hash`.
         holdout: the rule that chose the held-out photos; None where the scene defines them.
-        history: how cameras and points were found, see `Capture`; None if not recorded.
+        history: how cameras and points were found, see `Capture`.
         missing_photos: photos that the scene lists but that were not on disk.
         warnings: warnings about the scene.
         settings: as requested, with the downscale and contraction that were chosen.
@@ -51,7 +50,7 @@ class RunConfig:
     scene_fingerprint: str | None = None
     split_sha256: str | None = None
     holdout: str | None = None
-    history: Mapping[str, Any] | None = None
+    history: Mapping[str, Any] = field(default_factory=dict)
     missing_photos: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     settings: TrainSettings = field(default_factory=TrainSettings)
@@ -90,7 +89,7 @@ class RunConfig:
         return self.settings.downscale or 1
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of the file; its keys, as the fields, are in the same order as in all earlier versions."""
+        """Return the content of the file."""
         return {
             **{entry.name: getattr(self, entry.name) for entry in fields(self)},
             "scene": str(self.scene),
@@ -103,24 +102,21 @@ class RunConfig:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "RunConfig":
-        """Read the content that `to_json` returned, in this or an earlier version.
+        """Read the content that `to_json` returned.
 
         Raises:
             KeyError, TypeError, ValueError, AttributeError: the content is invalid.
         """
-        settings, selection = TrainSettings.from_json(content.get("settings", {})), content.get("selection")
-        return cls(
-            settings=settings,
-            scene=Path(content.get("scene", "")),
-            selection=None if selection is None else Selection.from_json(selection, wanted=settings.components),
-            missing_photos=tuple(content.get("missing_photos", ())),
-            warnings=tuple(content.get("warnings", ())),
-            versions=content.get("versions") or {},
-            **{name: content.get(name) for name in _COPIED_KEYS},
-        )
-
-
-_COPIED_KEYS = ("scene_kind", "unit", "unit_source", "scene_fingerprint", "split_sha256", "holdout", "history")
+        selection = content["selection"]
+        entries: dict[str, Any] = {
+            **content,
+            "scene": Path(content["scene"]),
+            "missing_photos": tuple(content["missing_photos"]),
+            "warnings": tuple(content["warnings"]),
+            "settings": TrainSettings.from_json(content["settings"]),
+            "selection": None if selection is None else Selection.from_json(selection),
+        }
+        return cls(**entries)
 
 
 def write_config(run: Path, config: RunConfig) -> None:
@@ -198,11 +194,6 @@ class Run:
     def given_cameras(self) -> RunCameras:
         """The same frames as the scene had them, before training refined their cameras."""
         return read_given_cameras(self.path)
-
-    @cached_property
-    def exposures(self) -> PhotoExposures:
-        """What is known of the exposures of held-out photos; earlier versions kept it in the file of the field."""
-        return self.cameras.exposures or PhotoExposures.from_json(load_tensors(self.field_path, "cpu")[1])
 
     @cached_property
     def log(self) -> list[LogEntry]:

@@ -11,7 +11,7 @@ from nerfcli.errors import UserError
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import KINDS
 from nerfcli.kernels import CONTRACTIONS
-from nerfcli.training.runs.components import Components, without_former
+from nerfcli.training.runs.components import Components
 
 DOWNSCALES = (1, 2, 4, 8)
 # `--downscale auto` takes the largest pictures whose longer side is at most this many pixels.
@@ -27,8 +27,6 @@ SAMPLES_PER_SECOND = 1e6
 # photos. The number of rows doubles at each of these numbers of samples. With 2^19 rows, the file of a field has 68 MB
 # and a step is an eighth slower than with 2^18.
 FEWEST_LOG2_ROWS, DOUBLE_ROWS_FROM = 16, (37e6, 74e6, 400e6)
-# Settings of earlier versions, with the only value that can still be read.
-_FORMER = {"photo_fraction": 1.0, "random_start": 0.0, "blocks": 0, "block": 0, "levels": 8, "width": 32}
 
 
 @dataclass(frozen=True)
@@ -142,16 +140,9 @@ class TrainSettings:
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> "TrainSettings":
-        """Read the content that `to_json` returned, in this or an earlier version; missing entries have their defaults.
-
-        Raises:
-            UserError: see `without_former`.
-        """
-        names = {entry.name for entry in dataclasses.fields(cls)}
-        given = without_former(content, _FORMER)
-        entries: dict[str, Any] = {name: value for name, value in given.items() if name in names}
-        entries["components"] = Components.from_json(content.get("components", {}))
-        entries["fixed"] = tuple(content.get("fixed", ()))
+        """Read the content that `to_json` returned."""
+        components, fixed = Components(**content["components"]), tuple(content["fixed"])
+        entries: dict[str, Any] = {**content, "components": components, "fixed": fixed}
         return cls(**entries)
 
 
