@@ -1,4 +1,4 @@
-"""Storage: counts against the modules themselves and hand arithmetic; sizes chosen for a capture."""
+"""Storage: counts against what a checkpoint holds; sizes chosen for a capture."""
 
 from dataclasses import replace
 
@@ -23,8 +23,10 @@ SEVERAL: list[FieldSettings] = [
 
 
 @pytest.mark.parametrize("settings", SEVERAL, ids=str)
-def test_bytes_are_those_of_the_module(settings):
-    assert parameter_bytes(settings) == field_bytes(fresh_field(settings))
+def test_bytes_are_those_of_the_checkpoint(settings):
+    field = fresh_field(settings)
+    stored = sum(4 * tensor.numel() for tensor in field.state_dict().values())
+    assert parameter_bytes(settings) == field_bytes(field) == stored
 
 
 @pytest.mark.parametrize(

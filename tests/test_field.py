@@ -17,7 +17,6 @@ from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.field.fourier_field import fourier_features
 from nerfcli.field.hash_field import HashField, HashFieldSettings
-from nerfcli.field.kinds import field_bytes
 from nerfcli.kernels import spherical_harmonics
 from nerfcli.render import model as model_file
 from nerfcli.render.model import Model, load_model, save_model
@@ -140,11 +139,6 @@ def test_resolutions_run_from_coarsest_to_finest_in_geometric_progression():
     sides = HashFieldSettings(contraction="none", levels=5, coarsest=16, finest=256).resolutions
     assert sides == (16, 32, 64, 128, 256)
     assert HashFieldSettings(contraction="none", levels=1, coarsest=16).resolutions == (16,)
-
-
-def test_field_bytes_are_those_of_the_checkpoint():
-    field = HashField(TINY)
-    assert field_bytes(field) == sum(4 * tensor.numel() for tensor in field.state_dict().values())
 
 
 def awkward_tensors() -> dict[str, torch.Tensor]:

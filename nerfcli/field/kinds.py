@@ -1,18 +1,19 @@
 """Kinds of fields: how each is made, how large it is, what it costs."""
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
+import torch
 from torch import nn
 
 from nerfcli.errors import UserError
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
-from nerfcli.field.hash_field import GEOMETRY, HARMONICS, HashField, HashFieldSettings
+from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
-from nerfcli.field.voxel_field import FEATURES, VoxelField, VoxelFieldSettings
+from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
 
 _FIELDS: dict[type[FieldSettings], type[Field]] = {
     HashFieldSettings: HashField,
@@ -121,49 +122,22 @@ def _largest_within(sizes: Sequence[int], settings: Callable[[int], FieldSetting
     Raises:
         UserError: not even the first one does.
     """
-    smallest = parameter_bytes(settings(sizes[0]))
     limit = memory_bytes * (1 + SLACK)
-    if smallest > limit:
+    fitting = bisect_right(sizes, limit, key=lambda size: parameter_bytes(settings(size)))
+    if fitting == 0:
+        smallest = parameter_bytes(settings(sizes[0]))
         raise UserError(
             f"no field fits into {memory_bytes} bytes: the smallest needs {smallest}", "give a larger --field-memory"
         )
-    fitting = [size for size in sizes if parameter_bytes(settings(size)) <= limit]
-    return settings(fitting[-1])
+    return settings(sizes[fitting - 1])
 
 
 def parameter_bytes(settings: FieldSettings) -> int:
-    """Return the bytes of a field's float32 parameters, before it is made; see `parameter_count`."""
-    return 4 * parameter_count(settings)
+    """Return the bytes of a field's parameters, before it is made."""
+    with torch.device("meta"):  # which takes neither memory nor random numbers
+        return field_bytes(fresh_field(settings))
 
 
 def field_bytes(field: nn.Module) -> int:
     """Return the bytes of a field's parameters."""
     return sum(parameter.nbytes for parameter in field.parameters())
-
-
-def parameter_count(settings: FieldSettings) -> int:
-    """Return how many numbers a field with these settings learns.
-
-    Raises:
-        ValueError: an unknown kind.
-    """
-    match settings:
-        case HashFieldSettings():
-            width = settings.width
-            density = (settings.levels * settings.features, width, GEOMETRY)
-            colour = (GEOMETRY + HARMONICS, width, width, 3)
-            return settings.levels * 2**settings.log2_rows * settings.features + _products(density) + _products(colour)
-        case VoxelFieldSettings():
-            return settings.layers * 2**settings.log2_vertices * FEATURES
-        case FourierFieldSettings():
-            trunk = (6 * settings.octaves, *[settings.width] * settings.layers)
-            colour = (settings.width + HARMONICS, settings.width // 2, 3)
-            biases = sum(trunk[1:]) + 1 + sum(colour[1:])
-            return _products(trunk) + settings.width + _products(colour) + biases
-        case _:
-            raise ValueError(f"the size of {type(settings).__name__} is unknown")
-
-
-def _products(sizes: Sequence[int]) -> int:
-    """Return the number of weights of consecutive layers, without biases."""
-    return sum(inputs * outputs for inputs, outputs in pairwise(sizes))
