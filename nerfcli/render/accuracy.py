@@ -6,8 +6,6 @@ every interval cut into 2 and into 4 parts, and the field evaluated in each part
 the field. Only held-out photos and depths can show how far the field is from the scene.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -29,49 +27,6 @@ IN_WORDS = (
 TIGHT = 1e-6
 
 
-@dataclass(frozen=True)
-class Spread:
-    """Statistics of absolute differences, and the number of values."""
-
-    values: int
-    median: float
-    percentile_95: float
-
-
-@dataclass(frozen=True)
-class MeasuredError:
-    """Differences between renderings of the same rays.
-
-    Args:
-        colour: of the channel that differs most, sRGB in [0, 1], between whole intervals and intervals cut into 4.
-        colour_halved: the same between intervals cut into 2 and into 4: if it is much smaller, the steps converge.
-        depth, depth_halved: the same for the requested depth, in the unit of the scene; None without depth.
-        depth_stop: change of depth due to the tolerance of pictures; it has no bound, because the light that was left
-            out may end anywhere. None without depth.
-    """
-
-    colour: Spread
-    colour_halved: Spread
-    depth: Spread | None
-    depth_halved: Spread | None
-    depth_stop: Spread | None
-
-    def to_json(self) -> dict[str, float]:
-        """Return plain numbers by name, without depth if none was requested."""
-        named = {
-            "quadrature_of_colour": self.colour,
-            "quadrature_of_colour_halved": self.colour_halved,
-            "quadrature_of_depth": self.depth,
-            "quadrature_of_depth_halved": self.depth_halved,
-            "truncation_of_depth": self.depth_stop,
-        }
-        numbers: dict[str, float] = {"pixels_measured": self.colour.values}
-        for name, spread in named.items():
-            if spread is not None:
-                numbers |= {f"{name}_median": spread.median, f"{name}_p95": spread.percentile_95}
-        return numbers
-
-
 def truncation_bounds(picture: RenderedPicture, tolerance: float) -> dict[str, float]:
     """Return the error bounds stored in a picture: the tolerance, the maximum and the mean bound of its pixels."""
     error = picture.truncation_error
@@ -83,24 +38,42 @@ def truncation_bounds(picture: RenderedPicture, tolerance: float) -> dict[str, f
 
 
 @torch.no_grad()
-def measure_error(model: TrainedField, frame: Frame, *, depth: DepthRequest | None) -> MeasuredError:
+def measure_error(model: TrainedField, frame: Frame, *, depth: DepthRequest | None) -> dict[str, float]:
     """Render the centres of 256 random pixels, always the same ones, with finer and finer intervals.
 
     Args:
         frame: camera and pose in the scene's frame.
         depth: the depth to measure along with the colour.
+
+    Returns:
+        The number of pixels, and median and 95th percentile (NAME_median, NAME_p95) of the absolute differences
+
+        quadrature_of_colour: of the channel that differs most, sRGB in [0, 1], between whole intervals and intervals
+            cut into 4; quadrature_of_colour_halved: between intervals cut into 2 and into 4: if it is much smaller, the
+            steps converge.
+        quadrature_of_depth, quadrature_of_depth_halved: the same for the requested depth, in the unit of the scene.
+        truncation_of_depth: of depth due to the tolerance of pictures; it has no bound, because the light that was left
+            out may end anywhere.
     """
     total = frame.camera.width * frame.camera.height
     pixels = np.sort(np.random.default_rng(0).choice(total, size=min(total, 256), replace=False))
     rgb, distances = (values.double().cpu().numpy() for values in _renderings(model, frame, pixels, depth=depth))
-    with_depth = depth is not None
-    return MeasuredError(
-        colour=_spread(np.abs(rgb[1] - rgb[3]).max(-1)),
-        colour_halved=_spread(np.abs(rgb[2] - rgb[3]).max(-1)),
-        depth=_spread(np.abs(distances[1] - distances[3])) if with_depth else None,
-        depth_halved=_spread(np.abs(distances[2] - distances[3])) if with_depth else None,
-        depth_stop=_spread(np.abs(distances[0] - distances[1])) if with_depth else None,
-    )
+    differences = {
+        "quadrature_of_colour": np.abs(rgb[1] - rgb[3]).max(-1),
+        "quadrature_of_colour_halved": np.abs(rgb[2] - rgb[3]).max(-1),
+    }
+    if depth is not None:
+        differences |= {
+            "quadrature_of_depth": np.abs(distances[1] - distances[3]),
+            "quadrature_of_depth_halved": np.abs(distances[2] - distances[3]),
+            "truncation_of_depth": np.abs(distances[0] - distances[1]),
+        }
+    numbers: dict[str, float] = {"pixels_measured": len(rgb[0])}
+    for name, values in differences.items():
+        finite = values[np.isfinite(values)]
+        median, high = np.percentile(finite, (50, 95)).tolist() if finite.size else (0.0, 0.0)
+        numbers |= {f"{name}_median": median, f"{name}_p95": high}
+    return numbers
 
 
 def refine_cuts(cuts: Tensor, parts: int) -> Tensor:
@@ -142,12 +115,3 @@ def _renderings(
         return along_ray if depth.axis == "ray" else torch.where(cosines > 0, along_ray * cosines, torch.nan)
 
     return torch.stack([one.rgb.clamp(0.0, 1.0) for one in seen]), torch.stack([distance(one) for one in seen])
-
-
-def _spread(differences: np.ndarray) -> Spread:
-    """Return the spread of the values that are defined; zeros where there are none."""
-    finite = differences[np.isfinite(differences)]
-    if finite.size == 0:
-        return Spread(0, 0.0, 0.0)
-    median, high = np.percentile(finite, (50, 95))
-    return Spread(finite.size, float(median), float(high))

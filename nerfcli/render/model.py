@@ -9,14 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.field.background import Background, SphereBackground
 from nerfcli.field.checkpoint import read_checkpoint, refuse_non_finite, save_tensors, tensors_of
 from nerfcli.field.kinds import fresh_field, settings_from_json
 from nerfcli.render.accuracy import measure_error
-from nerfcli.render.depth import DepthRequest
 from nerfcli.render.pictures import render_picture
 from nerfcli.render.trained_field import Marching, TrainedField
 
@@ -26,13 +24,13 @@ BACKGROUND, FINE = "background.logits", "fine"
 
 @dataclass(frozen=True)
 class Model(TrainedField):
-    """A trained field that renders pictures, see `TrainedField` for its data and `render_picture` for `render`."""
+    """A trained field that renders pictures.
+
+    See `TrainedField` for its data, `render_picture` for `render`, and `measure_error` for `measured_error`.
+    """
 
     render = render_picture
-
-    def measured_error(self, frame: Frame, *, depth: DepthRequest | None) -> dict[str, float]:
-        """Return the measured error of the rendering, see `measure_error`."""
-        return measure_error(self, frame, depth=depth).to_json()
+    measured_error = measure_error
 
 
 def save_model(path: Path, model: Model) -> None:
