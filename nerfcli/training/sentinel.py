@@ -140,12 +140,9 @@ class Sentinel:
             raise NonFiniteError
         # Given equal sums, two kinds of processors may take steps that differ in the last bit.
         distributed.copy_from_first(*tensors.values())
-        if self._tensors.keys() == tensors.keys():  # reuse the memory of the last copy
-            for name, tensor in tensors.items():
-                self._tensors[name].copy_(tensor)
-            self._description = description
-        else:  # Adam has no moments before its first step
-            self._tensors, self._description = _copied(tensors, description)
+        for name, tensor in tensors.items():
+            self._tensors[name].copy_(tensor)
+        self._description = description
         self._progress = [progress]
 
     def _go_back(self) -> None:
