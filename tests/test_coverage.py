@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+import torch
 from commands import error_of, nerfcli
 from fog import fog, foggy_cells
 from PIL import Image
@@ -150,6 +151,24 @@ def test_the_largest_angle_is_between_any_two_cameras():
     for order in ([0, 1, 2], [1, 0, 2], [1, 2, 0], [2, 1, 0]):
         found = largest_angle_deg(np.ones((1, 3), dtype=bool), np.zeros((1, 3)), centres[order])
         np.testing.assert_allclose(found, [80.0], atol=1e-3)
+
+
+def test_angles_between_many_cameras_take_little_memory(monkeypatch):
+    """All pairs of 300 photos at 4,096 points were 1.5 GB; the answer is that of a loop over the points."""
+    product, largest, rng = torch.bmm, [], np.random.default_rng(0)
+
+    def measured(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+        found = product(one, other)
+        largest.append(found.nbytes)
+        return found
+
+    monkeypatch.setattr(torch, "bmm", measured)
+    centres, points = 3 * rng.normal(size=(300, 3)), rng.normal(size=(600, 3))
+    found = largest_angle_deg(np.ones((600, 300), bool), points, centres)
+    assert max(largest) <= 2**27
+    rays = centres - points[:3, None]
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    np.testing.assert_allclose(found[:3], [np.degrees(np.arccos((r @ r.T).min())) for r in rays], atol=0.05)
 
 
 def plane_map(incidence_deg: float) -> DepthMap:

@@ -60,6 +60,8 @@ SAME = 0.01
 STEEPEST_DEG = 80.0
 # Number of points processed at a time, so that their data stay in the processor's cache.
 _BLOCK = 2**12
+# Number of angles between two rays that are compared at a time: each point has as many as pairs of cameras.
+_ANGLES = 2**25
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,8 @@ def largest_angle_deg(seen: np.ndarray, points: np.ndarray, centres: np.ndarray)
         chosen = np.where(here, np.arange(len(used)), here.argmax(axis=1)[:, None])
         away = (centres[used] - points[rows, None]).astype(np.float32)  # (rows, used, 3)
         rays = normalize(torch.from_numpy(np.take_along_axis(away, chosen[..., None], axis=1)), dim=-1)
-        cosines = torch.bmm(rays, rays.transpose(1, 2)).amin((1, 2)).numpy()
+        parts = rays.split(max(1, _ANGLES // len(used) ** 2))
+        cosines = torch.cat([torch.bmm(part, part.transpose(1, 2)).amin((1, 2)) for part in parts]).numpy()
         largest[rows] = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
     return largest
 
