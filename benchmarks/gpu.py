@@ -182,7 +182,7 @@ def fitting_of(capture: Path, device: Any, batch: int, log2_rows: int) -> tuple[
     first = captured.train_frames[0].camera
     dry = device.type == "cpu"
     frames = captured.train_frames[:3] if dry else captured.train_frames
-    photos = load_photos(frames, factor=8 if dry else automatic_downscale(first), threads=4)
+    photos = load_photos(frames, factor=8 if dry else automatic_downscale([first]), threads=4)
     settings = TrainSettings(
         budget_seconds=None,
         steps=1000,

@@ -455,9 +455,12 @@ def test_impossible_settings_are_refused(wrong, message):
 
 def test_automatic_downscale_is_the_smallest_that_fits():
     sides = [(800, 600), (801, 600), (600, 1600), (1601, 10), (3200, 3200), (3201, 10), (6400, 9), (20000, 1)]
-    assert [automatic_downscale(Camera.pinhole(*size, 500.0)) for size in sides] == [1, 2, 2, 4, 4, 8, 8, 8]
+    cameras = [Camera.pinhole(*size, 500.0) for size in sides]
+    assert [automatic_downscale([camera]) for camera in cameras] == [1, 2, 2, 4, 4, 8, 8, 8]
+    # One small photo, even the first of all, does not have the others trained at their full size.
+    assert [automatic_downscale([cameras[0], *[cameras[3]] * count]) for count in (0, 1, 9)] == [1, 4, 4]
     panoramas = [Camera("EQUIRECTANGULAR", width, width // 2, (width, width // 2)) for width in (1600, 1602, 5760)]
-    assert [automatic_downscale(panorama) for panorama in panoramas] == [1, 2, 4]
+    assert [automatic_downscale([panorama]) for panorama in panoramas] == [1, 2, 4]
 
 
 def test_cameras_of_a_run_come_back_exactly_and_move_with_it(tmp_path, spheres):

@@ -81,7 +81,7 @@ def prepare(
     """
     refuse_without_training_photos(scene)
     device, masks, threads = torch.device(settings.device), settings.components.masks, settings.threads
-    factor = settings.downscale or automatic_downscale(scene.train_frames[0].camera)
+    factor = settings.downscale or automatic_downscale([frame.camera for frame in scene.train_frames])
     needs = needs_of((*scene.train_frames, *scene.test_frames), factor, settings=settings)
     if device.type == "cuda":
         notify(check_device_memory(needs, device, memory_bytes))

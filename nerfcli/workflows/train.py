@@ -293,7 +293,7 @@ def plan_training(
     """
     loaded = load_scene(Path(scene), holdout=holdout)
     refuse_without_training_photos(loaded)
-    factor = settings.downscale or automatic_downscale(loaded.train_frames[0].camera)
+    factor = settings.downscale or automatic_downscale([frame.camera for frame in loaded.train_frames])
     needs = needs_of((*loaded.train_frames, *loaded.test_frames), factor, settings=settings)
     limit = resources.memory_limit() if settings.device == "cpu" else None
     storage, _ = storage_for(needs, limit, folder=Path(gettempdir()))

@@ -2,7 +2,9 @@
 
 import dataclasses
 import math
+import statistics
 from bisect import bisect
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -151,12 +153,14 @@ def sizes_for(device: str) -> dict[str, Any]:
     return GPU_SIZES if device.startswith("cuda") else {}
 
 
-def automatic_downscale(camera: Camera) -> int:
+def automatic_downscale(cameras: Sequence[Camera]) -> int:
     """Return the smallest downscale that brings the longer side to `AUTO_LONGER_SIDE_PX` or below; twice that for
-    panoramas, which show more with as many pixels.
+    panoramas, which show more with as many pixels. Of photos of several sizes, it is that of the median.
     """
+    return statistics.median_high(map(_fitting_downscale, cameras))
+
+
+def _fitting_downscale(camera: Camera) -> int:
     most = 2 * AUTO_LONGER_SIDE_PX if camera.is_spherical else AUTO_LONGER_SIDE_PX
-    for factor in DOWNSCALES:
-        if max(camera.width, camera.height) / factor <= most:
-            return factor
-    return DOWNSCALES[-1]
+    fitting = (factor for factor in DOWNSCALES if max(camera.width, camera.height) / factor <= most)
+    return next(fitting, DOWNSCALES[-1])
