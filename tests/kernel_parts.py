@@ -1,17 +1,9 @@
-"""Single kernel operations, and fields evaluated at single points, for tests of one of them alone."""
+"""Fields evaluated at single points."""
 
-from types import ModuleType
-
-import torch
 from torch import Tensor
 
 from nerfcli.field.interface import Field
-from nerfcli.kernels import HashGrid, numba_cpu, reference, spherical_harmonics
-
-
-def parts_for(dtype: torch.dtype) -> ModuleType:
-    """Return the module of operations that compute a field of this precision on a CPU."""
-    return numba_cpu if dtype == torch.float32 else reference
+from nerfcli.kernels import HashGrid, reference, spherical_harmonics
 
 
 def density_of(field: Field, coordinates: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles import quadrature_of_end_density, quadrature_of_squares
 
-from nerfcli.kernels import numba_cpu, reference
+from nerfcli.kernels import RayTermination, numba_cpu, reference
 from nerfcli.kernels.reference import depth
 from nerfcli.render.depth import DepthRequest, disagreement, fractions, requested, spread
 
@@ -183,3 +183,20 @@ def test_max_weight_takes_the_nearest_of_equals():
     for module in (depth, numba_cpu):
         light = module.ray_termination(density, starts, starts + 1, offsets=torch.tensor([0, 3]), fractions=())
         assert light.peak.tolist() == [1.5]
+
+
+def test_light_that_passes_counts_at_the_background():
+    """Points at 1, 2 and 3 that stop 1/2, 1/4 and 3/16 of the light: the rest, 1/16, ends at the background."""
+    offsets, places = torch.tensor([0, 3]), torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    weights = torch.tensor([1 / 2, 1 / 4, 3 / 16], dtype=torch.float64)
+    mean, left = depth.conditional(weights, places, offsets), torch.tensor([1 / 16], dtype=torch.float64)
+    assert mean.item() == pytest.approx(5 / 3, rel=1e-15)
+    ends = RayTermination(1 - left, left, mean, mean, mean, mean, mean.new_empty(1, 0))
+    for convention, far, wanted in (
+        ("moment", 4.0, 25 / 16),
+        ("background", 4.0, 29 / 16),
+        ("background", 100.0, 7.8125),
+    ):
+        request = DepthRequest(convention, "ray", background_distance=far)
+        found = requested(request, ends, background_distance=mean.new_tensor([far]))
+        assert found.item() == pytest.approx(wanted, rel=1e-15)
