@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import ExifTags, Image
+from trainings import fit
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -28,7 +29,6 @@ from nerfcli.training import schedule
 from nerfcli.training.appearance import Appearance
 from nerfcli.training.checkpoints import Checkpoints, Totals
 from nerfcli.training.fitting import Fitting
-from nerfcli.training.loop import Progress, train
 from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.preparation import EarlierDecisions, prepare
 from nerfcli.training.runs.components import Components, Selection
@@ -79,19 +79,6 @@ def capture(tmp_path: Path) -> Capture:
         for i in range(4)
     )
     return Capture(frames, np.zeros((0, 3)), kind="colmap", root=tmp_path, test_names=frozenset({"0.png"}))
-
-
-def fit(scene: Capture, run: Path, settings: TrainSettings, *, resume: bool = False, stop_at: int = -1) -> list[float]:
-    """Train and return the loss of every step."""
-    losses: list[float] = []
-
-    def record(progress: Progress) -> None:
-        losses.append(progress.loss)
-        if progress.step == stop_at:
-            raise KeyboardInterrupt
-
-    train(scene, run, settings, resume=resume, notify=lambda text: None, on_progress=record)
-    return losses
 
 
 def test_the_srgb_curve_is_that_of_the_standard_and_its_own_inverse():
@@ -337,7 +324,8 @@ def test_a_run_keeps_background_and_exposures_and_goes_on_bit_for_bit(capture, t
     straight = fit(capture, tmp_path / "straight", SHORT)
     with pytest.raises(KeyboardInterrupt):
         fit(capture, tmp_path / "parts", SHORT, stop_at=3)
-    assert fit(capture, tmp_path / "parts", SHORT, resume=True) == straight[3:]
+    second = fit(capture, tmp_path / "parts", SHORT, resume=True)
+    assert [progress.loss for progress in second] == [progress.loss for progress in straight[3:]]
     states = [load_tensors(tmp_path / name / "state.safetensors", "cpu")[0] for name in ("straight", "parts")]
     assert torch.equal(states[0]["parts.exposure.free"], states[1]["parts.exposure.free"])
     assert states[0]["parts.exposure.free"][:, 0].tolist() == pytest.approx(

@@ -15,14 +15,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import SPHERES
+from trainings import fit
 
-from nerfcli.captures.capture import Capture
 from nerfcli.captures.loading import load_scene
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.matching.sky import sky_masks
 from nerfcli.photos.images import read_image, write_png
 from nerfcli.training import checkpoints, evidence, loop, schedule, selection
-from nerfcli.training.loop import train
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.files import FIELD, read_log
 from nerfcli.training.runs.settings import TrainSettings
@@ -70,12 +69,6 @@ def settings(model: str, components: Components) -> TrainSettings:
         model=model,
         components=components,
     )
-
-
-def fit(scene: Capture, run: Path, chosen: TrainSettings) -> list[str]:
-    reported: list[str] = []
-    train(scene, run, chosen, resume=False, notify=reported.append, on_progress=lambda progress: None)
-    return reported
 
 
 def is_held_out(name: str, capture: Path) -> bool:
@@ -159,7 +152,7 @@ def test_held_out_photos_that_are_gone_do_not_undo_a_training(capture, tmp_path)
     loaded = load_scene(capture)
     for photo in (capture / HELD_OUT).glob("*.png"):
         photo.unlink()
-    reported = fit(loaded, tmp_path / "run", replace(settings("default", Components()), steps=4))
+    fit(loaded, tmp_path / "run", replace(settings("default", Components()), steps=4), notes=(reported := []))
     assert (tmp_path / "run" / FIELD).exists()
     assert any("PSNR on held-out photos could not be measured" in line for line in reported)
     assert not (tmp_path / "run" / checkpoints.WAYPOINTS_FOLDER).exists()

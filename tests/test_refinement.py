@@ -1,7 +1,6 @@
 """Camera refinement: derivatives against differences, what the gauge must not change, and removal of a known noise."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 from lenses import HEIGHT, MODELS, WIDTH, random_camera
+from trainings import fit
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.lens_change import bearings_by_change, changeable, changed
@@ -29,7 +29,6 @@ from nerfcli.field.checkpoint import load_tensors
 from nerfcli.photos.loading import load_photos
 from nerfcli.training.extent import Extent
 from nerfcli.training.fitting import Fitting, TrainingInputs
-from nerfcli.training.loop import train
 from nerfcli.training.optimiser import (
     BETAS,
     EPS,
@@ -555,23 +554,12 @@ def test_displaced_cameras_return_to_their_places_in_a_trained_field(spheres, sp
     assert error_px() < before / 2
 
 
-def fit(scene: Capture, run: Path, settings: TrainSettings, *, resume: bool = False) -> None:
-    train(scene, run, settings, resume=resume, notify=lambda text: None, on_progress=lambda progress: None)
-
-
 def test_resuming_goes_on_with_the_cameras_bit_for_bit(small, tmp_path):
     settings = replace(FEW, components=Components(cameras="all"))
     fit(small, tmp_path / "straight", settings)
     # Schedules depend on the fraction of all steps: a training of half the steps would have another schedule.
-    stopped: list[int] = []
-
-    def stop(progress) -> None:
-        stopped.append(progress.step)
-        if progress.step == 7:
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        train(small, tmp_path / "parts", settings, resume=False, notify=lambda text: None, on_progress=stop)
+        fit(small, tmp_path / "parts", settings, stop_at=7)
     fit(small, tmp_path / "parts", settings, resume=True)
     ours, theirs = (load_tensors(tmp_path / name / STATE, "cpu")[0] for name in ("straight", "parts"))
     assert ours.keys() == theirs.keys()

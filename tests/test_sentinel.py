@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from trainings import fit, weights
 
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import NON_FINITE, UserError
@@ -18,7 +19,6 @@ from nerfcli.kernels.numba_cpu.backend import NumbaBackend
 from nerfcli.render.model import load_model, save_model
 from nerfcli.render.pictures import render_picture
 from nerfcli.training import fitting, sentinel, step
-from nerfcli.training.loop import train
 from nerfcli.training.optimiser import Delayed
 from nerfcli.training.runs.files import read_log
 from nerfcli.training.runs.settings import TrainSettings
@@ -34,16 +34,10 @@ def views(spheres: Capture) -> Capture:
     return replace(spheres, frames=spheres.frames[:3], test_names=frozenset())
 
 
-def fit(scene: Capture, run: Path, settings: TrainSettings = FEW, *, resume: bool = False) -> list[str]:
+def reported_by(scene: Capture, run: Path) -> list[str]:
     """Train, and return the messages for the user."""
-    reported: list[str] = []
-    train(scene, run, settings, resume=resume, notify=reported.append, on_progress=lambda progress: None)
-    return reported
-
-
-def weights(run: Path) -> dict[str, bytes]:
-    tensors, _ = load_tensors(run / "field.safetensors", "cpu")
-    return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
+    fit(scene, run, FEW, notes=(notes := []))
+    return notes
 
 
 def with_rate_factors(factor_at: Callable[[fitting.Fitting], float]) -> Callable[..., None]:
@@ -75,7 +69,7 @@ def test_a_failure_is_passed_with_smaller_steps_and_counted(views, tmp_path, mon
     poisoned = with_rate_factors(lambda state: math.nan if state.step == 7 and state.rollbacks == 0 else 1.0)
     monkeypatch.setattr(fitting, "update", poisoned)
     monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)
-    reported = fit(views, tmp_path / "run")
+    reported = reported_by(views, tmp_path / "run")
     (line,) = [line for line in reported if "continuing from step" in line]
     # The rate is wrong in the eighth step; the table comes first among what it spoils. The loss shows it a step later.
     assert line.startswith("table is not finite at step 8")
@@ -93,10 +87,10 @@ def test_the_way_back_is_exact(views, tmp_path, monkeypatch):
     # After the rollback, training equals one whose learning rate is halved from the snapshot on.
     monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)
     monkeypatch.setattr(fitting, "update", with_rate_factors(lambda state: 1.0 if state.step < 4 else 0.5))
-    fit(views, tmp_path / "known")
+    fit(views, tmp_path / "known", FEW)
     poisoned = with_rate_factors(lambda state: math.inf if state.step == 6 and state.rollbacks == 0 else 1.0)
     monkeypatch.setattr(fitting, "update", poisoned)
-    fit(views, tmp_path / "found")
+    fit(views, tmp_path / "found", FEW)
     assert weights(tmp_path / "found") == weights(tmp_path / "known")
 
 
@@ -123,11 +117,11 @@ def make_flaky(monkeypatch: pytest.MonkeyPatch, bad_call: int) -> None:
 
 @pytest.mark.parametrize(("bad_call", "on_gpu"), [(8, False), (8, True), (12, True)], ids=str)
 def test_a_fault_that_does_not_come_back_changes_nothing(bad_call, on_gpu, views, tmp_path, monkeypatch):
-    fit(views, tmp_path / "straight")
+    fit(views, tmp_path / "straight", FEW)
     if on_gpu:
         monkeypatch.setattr(Delayed, "exchange", read_a_step_later)
     make_flaky(monkeypatch, bad_call)
-    reported = fit(views, tmp_path / "flaky")
+    reported = reported_by(views, tmp_path / "flaky")
     assert any("but are finite when the step is repeated" in line for line in reported)
     assert weights(tmp_path / "flaky") == weights(tmp_path / "straight")
     assert not list((tmp_path / "flaky").glob("failure-*"))
@@ -140,13 +134,13 @@ def test_where_no_two_runs_are_the_same_a_failure_is_found_all_the_same(views, t
     with monkeypatch.context() as patched:
         patched.setattr(fitting, "update", poisoned)
         patched.setattr(sentinel, "SNAPSHOT_EVERY", 4)
-        reported = fit(views, tmp_path / "poisoned")
+        reported = reported_by(views, tmp_path / "poisoned")
     (line,) = [line for line in reported if "continuing from step" in line]
     assert line.startswith("table is not finite at step 8")
     _, description = load_tensors(tmp_path / "poisoned" / "failure-8.safetensors", "cpu")
     assert description["state"]["step"] == 7
     make_flaky(monkeypatch, 9)
-    reported = fit(views, tmp_path / "flaky")
+    reported = reported_by(views, tmp_path / "flaky")
     assert any("this device does not repeat results exactly" in line for line in reported)
 
 

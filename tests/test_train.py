@@ -6,7 +6,6 @@ import math
 import os
 import shutil
 import signal
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import SPHERES
+from trainings import fit, weights
 
 from nerfcli import kernels
 from nerfcli.cameras.camera import Camera
@@ -38,7 +38,7 @@ from nerfcli.render.files.float_maps import read_tiff
 from nerfcli.render.model import load_model
 from nerfcli.render.pictures import DepthRequest, render_picture
 from nerfcli.training import loop, sentinel
-from nerfcli.training.loop import Progress, train
+from nerfcli.training.loop import Progress
 from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.runs.components import Components, choose
 from nerfcli.training.runs.files import LogEntry, append_log, read_log
@@ -62,42 +62,11 @@ def views(spheres: Capture) -> Capture:
     return replace(spheres, frames=spheres.frames[:4], test_names=frozenset())
 
 
-def fit(
-    scene: Capture, run: Path, settings: TrainSettings, *,
-    resume: bool = False, on_progress: Callable[[Progress], None] = lambda progress: None,
-) -> list[Progress]:  # fmt: skip
-    """Train, and return the progress of every step."""
-    steps: list[Progress] = []
-
-    def record(progress: Progress) -> None:
-        steps.append(progress)
-        on_progress(progress)
-
-    train(scene, run, settings, resume=resume, notify=lambda text: None, on_progress=record)
-    return steps
-
-
-def stop_at(step: int) -> Callable[[Progress], None]:
-    """Return what ends a training after a step as Ctrl-C does."""
-
-    def stop(progress: Progress) -> None:
-        if progress.step == step:
-            raise KeyboardInterrupt
-
-    return stop
-
-
 @pytest.fixture(scope="module")
 def straight(views: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Progress]]:
     """A training with `ADAPTIVE` that nothing interrupts, and the progress of its steps. Do not write into its run."""
     run = tmp_path_factory.mktemp("straight") / "run"
     return run, fit(views, run, ADAPTIVE)
-
-
-def weights(run: Path) -> dict[str, bytes]:
-    """Every tensor of a run's checkpoint, as bytes."""
-    tensors, _ = load_tensors(run / "field.safetensors", "cpu")
-    return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
 
 
 def held_out_photos(scene: Capture) -> list[HeldOutPhoto]:
@@ -211,7 +180,7 @@ def test_interrupted_and_resumed_equals_straight_bit_for_bit(views, straight, tm
     assert kernels.backend_for(torch.device("cpu"), torch.float32).deterministic
     whole, steps = straight
     with pytest.raises(KeyboardInterrupt):
-        fit(views, tmp_path / "parts", ADAPTIVE, on_progress=stop_at(11))
+        fit(views, tmp_path / "parts", ADAPTIVE, stop_at=11)
     halfway = load_model(tmp_path / "parts" / "field.safetensors", "cpu")  # the run left by Ctrl-C can be loaded
     assert all(torch.isfinite(tensor).all() for tensor in halfway.field.state_dict().values())
     assert not Run(tmp_path / "parts").is_complete(ADAPTIVE)
@@ -230,7 +199,7 @@ def test_fields_of_other_kinds_train_and_resume_bit_for_bit(kind, views, tmp_pat
     settings = replace(FEW, steps=10, field=kind, field_memory_bytes=50_000)
     straight = fit(views, tmp_path / "straight", settings)
     with pytest.raises(KeyboardInterrupt):
-        fit(views, tmp_path / "parts", settings, on_progress=stop_at(5))
+        fit(views, tmp_path / "parts", settings, stop_at=5)
     second = fit(views, tmp_path / "parts", settings, resume=True)
     assert [progress.loss for progress in second] == [progress.loss for progress in straight[5:]]
     assert weights(tmp_path / "parts") == weights(tmp_path / "straight")
@@ -278,7 +247,7 @@ def test_detailed_fields_train_and_resume_bit_for_bit_with_their_fine_cells(view
     monkeypatch.setattr(hash_field, "DETAILED_LOG2_ROWS", FEW.log2_rows)
     straight = fit(views, tmp_path / "straight", FEW)
     with pytest.raises(KeyboardInterrupt):
-        fit(views, tmp_path / "parts", FEW, on_progress=stop_at(11))
+        fit(views, tmp_path / "parts", FEW, stop_at=11)
     second = fit(views, tmp_path / "parts", FEW, resume=True)
     assert [progress.loss for progress in second] == [progress.loss for progress in straight[11:]]
     states = [load_tensors(tmp_path / name / "state.safetensors", "cpu")[0] for name in ("straight", "parts")]
@@ -313,7 +282,7 @@ def test_a_resumed_training_keeps_its_components_seed_and_size_of_photos(views, 
     settings = replace(FEW, steps=6, downscale=4, seed=3, **chosen)
     fit(views, tmp_path / "straight", settings)
     with pytest.raises(KeyboardInterrupt):
-        fit(views, tmp_path / "parts", settings, on_progress=stop_at(3))
+        fit(views, tmp_path / "parts", settings, stop_at=3)
     for wanted in ("background=sphere", "distortion=0.05"):
         others = choose(settings.components, included=(wanted,), excluded=())
         changed = replace(settings, components=others, fixed=(wanted.partition("=")[0],))
@@ -331,13 +300,13 @@ def test_what_has_learned_goes_on_learning_in_a_larger_budget(views, tmp_path):
         return load_tensors(run / "field.safetensors", "cpu")[0]["table"][-1]
 
     with pytest.raises(KeyboardInterrupt):
-        fit(views, tmp_path / "fresh", replace(FEW, steps=400), on_progress=stop_at(4))
+        fit(views, tmp_path / "fresh", replace(FEW, steps=400), stop_at=4)
     assert finest(tmp_path / "fresh").abs().max() <= 1e-4  # as initialised
     fit(views, tmp_path / "run", replace(FEW, steps=3))
     learned = finest(tmp_path / "run")
     assert learned.abs().max() > 1e-4
     with pytest.raises(KeyboardInterrupt):
-        fit(views, tmp_path / "run", replace(FEW, steps=400), resume=True, on_progress=stop_at(4))
+        fit(views, tmp_path / "run", replace(FEW, steps=400), resume=True, stop_at=4)
     assert not torch.equal(finest(tmp_path / "run"), learned)
 
 
@@ -346,7 +315,7 @@ def test_a_kill_between_field_and_state_is_no_harm(last, views, straight, tmp_pa
     # The process dies between the two files of the second checkpoint, or of the first.
     whole, _ = straight
     with pytest.raises(KeyboardInterrupt):
-        fit(views, tmp_path / "run", ADAPTIVE, on_progress=stop_at(9))
+        fit(views, tmp_path / "run", ADAPTIVE, stop_at=9)
     if last == "state.safetensors":
         (tmp_path / "run" / "field.safetensors").unlink()  # the first time, the state is written first
     else:
