@@ -2,6 +2,9 @@
 
 import json
 import math
+import os
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +29,7 @@ from nerfcli.render.files.float_maps import (
     LARGEST_LEVEL,
     chosen_scale,
     depth_of_levels,
+    read_exr,
     read_tiff,
     write_exr,
     write_png16,
@@ -137,6 +141,16 @@ def test_colour_with_alpha_is_premultiplied_in_an_exr(tmp_path):
     with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
         pixel = [float(file.channels()[name].pixels[0, 0]) for name in "RGBA"]
     assert pixel == pytest.approx([0.25, 0.25 * 0.2140411, 0.0, 0.25], rel=1e-5)
+
+
+def test_maps_that_threads_read_leave_the_terminal_as_it_is(tmp_path):
+    """Regression: what each took for the terminal was what another one listened to, and the command fell silent."""
+    depth = np.random.default_rng(0).random((500, 500), np.float32)
+    write_exr(tmp_path / "a.exr", {"depth": depth}, META)
+    before = sys.stdout, os.fstat(2).st_ino
+    with ThreadPoolExecutor(4) as pool:
+        assert len(list(pool.map(lambda _: read_exr(tmp_path / "a.exr"), range(40)))) == 40
+    assert (sys.stdout, os.fstat(2).st_ino) == before
 
 
 def test_linear_light_of_known_colours():

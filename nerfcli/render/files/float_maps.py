@@ -12,6 +12,7 @@ import math
 import os
 import sys
 import tempfile
+import threading
 import tokenize
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -180,12 +181,15 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
             ) from error
 
 
+_CAPTURING = threading.Lock()  # the descriptor and sys.stdout belong to all threads
+
+
 @contextlib.contextmanager
 def _captured_stderr() -> Iterator[Callable[[], str]]:
     """Capture OpenEXR's messages about a damaged file, better than its exceptions; yield what returns the last line."""
-    sys.stderr.flush()
-    terminal = os.dup(2)
-    with tempfile.TemporaryFile() as log, contextlib.redirect_stdout(io.StringIO()):
+    with _CAPTURING, tempfile.TemporaryFile() as log, contextlib.redirect_stdout(io.StringIO()):
+        sys.stderr.flush()
+        terminal = os.dup(2)
 
         def last_line() -> str:
             log.seek(0)
