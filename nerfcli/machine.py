@@ -6,6 +6,7 @@ import platform
 import re
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -176,7 +177,7 @@ def resident_bytes(process: int | None = None) -> int:
 
 
 def peak_resident_bytes() -> int:
-    """Return the largest resident memory of this process since it began, in bytes."""
+    """Return the largest resident memory of this process since it or `begin_recent_peak` began, in bytes."""
     if sys.platform == "win32":
         import psutil
 
@@ -188,9 +189,10 @@ def peak_resident_bytes() -> int:
 
 
 def begin_recent_peak() -> None:
-    """Have `recent_peak_bytes` count from now on; Linux only."""
+    """Have the peaks of resident memory count from now on, where the system allows it: on Linux."""
     if _CLEAR_REFS.exists():
-        _CLEAR_REFS.write_text("5")  # resets the peak of the resident size: Linux, proc(5)
+        with suppress(OSError):  # some containers forbid it
+            _CLEAR_REFS.write_text("5")  # resets the peak of the resident size: Linux, proc(5)
 
 
 def recent_peak_bytes() -> int | None:

@@ -32,6 +32,7 @@ from nerfcli.evaluate.photos import HeldOutPhoto, over_white
 from nerfcli.evaluate.protocol import evaluate_model
 from nerfcli.field import hash_field
 from nerfcli.field.checkpoint import load_tensors
+from nerfcli.machine import peak_resident_bytes
 from nerfcli.photos.images import read_image, write_png
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.files.float_maps import read_tiff
@@ -381,6 +382,16 @@ def test_the_log_records_speed_memory_and_held_out_psnr(spheres, tmp_path):
     assert last["samples_per_second"] > 0
     assert last["rays_per_second"] > 0
     assert 2**26 < last["peak_memory_bytes"] < 2**34
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux counts from a moment on")
+def test_the_peak_of_memory_is_that_of_the_training(views, tmp_path):
+    """Regression: of several trainings in a process, each had the largest peak of those before it."""
+    large = np.ones(2**25)  # 268 MB
+    peak = peak_resident_bytes()
+    del large
+    fit(views, tmp_path / "run", replace(FEW, steps=1))
+    assert read_log(tmp_path / "run")[-1]["peak_memory_bytes"] < peak - 2**26
 
 
 def test_a_scene_without_held_out_photos_trains(views, tmp_path):

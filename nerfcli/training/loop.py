@@ -14,7 +14,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.errors import LOST_RANK, UserError
 from nerfcli.field.kinds import field_bytes
 from nerfcli.interrupts import deferred_interrupts
-from nerfcli.machine import peak_resident_bytes, use_threads
+from nerfcli.machine import begin_recent_peak, peak_resident_bytes, use_threads
 from nerfcli.photos.masks import write_masks
 from nerfcli.training.checkpoints import (
     Checkpoints,
@@ -113,6 +113,7 @@ def train(
         KeyboardInterrupt: passed on after a checkpoint has been written.
     """
     use_threads(settings.threads)
+    begin_recent_peak()
     kernels.prepare(notify, settings.device)
     saved, begun = distributed.from_first(lambda: read_checkpoint(run, settings) if resume else (None, None))
     if begun is not None:
