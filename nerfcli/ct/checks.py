@@ -9,7 +9,7 @@ from nerfcli.ct.centre import FEWEST_VIEWS, FINE, centre_of
 from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.geometry import ScanGeometry, circle_of
 from nerfcli.ct.open_beam import MEDIAN_DEVIATION
-from nerfcli.ct.quick import filled, highest_contrast_row, predicted, reconstructed
+from nerfcli.ct.quick import highest_contrast_row, predicted, reconstructed
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import several
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, finding, verdict_above, verdict_below, worst
@@ -55,9 +55,9 @@ def sample_of(scan: Scan) -> Sample:
     rows = np.unique(np.linspace(0, scan.geometry.rows - 1, min(MOST_ROWS, scan.geometry.rows)).round().astype(int))
     count = scan.geometry.views
     views = np.unique(np.linspace(0, count - 1, min(MOST_VIEWS, count)).round().astype(int))
-    integrals = np.stack([filled(scan, views, int(row))[:, 0] for row in rows], axis=1)
-    second = np.abs(np.diff(integrals, 2, axis=2)) if integrals.shape[2] > 4 else np.zeros((1, 1, 1))
-    inner = integrals[..., 1:-1] if integrals.shape[2] > 4 else integrals[..., :1]
+    integrals = np.stack([scan.only_rows(row, row + 1).line_integrals(views)[:, 0] for row in rows.tolist()], axis=1)
+    second = np.abs(np.diff(integrals, 2, axis=2)) if integrals.shape[2] > 4 else np.zeros_like(integrals)
+    inner = integrals[..., 1:-1] if integrals.shape[2] > 4 else integrals
     thin = inner <= np.quantile(inner, 0.25)
     noise = float(np.median(second[thin])) / MEDIAN_DEVIATION / np.sqrt(_SECOND) if thin.any() else 0.0
     return Sample(scan, rows, integrals, noise, float(np.quantile(integrals, 0.995)))

@@ -61,7 +61,7 @@ def highest_contrast_row(scan: Scan, views: np.ndarray | None = None) -> Row:
         rows = rows[np.abs(rows - middle) <= max(0.5, FAN_PART * geometry.rows)]
         rows = rows if len(rows) else np.array([int(np.clip(round(middle), 0, geometry.rows - 1))])
     some = views[:: max(1, len(views) // 16)]
-    shown = filled(scan, some)[:, rows].std(axis=(0, 2))
+    shown = scan.line_integrals(some)[:, rows].std(axis=(0, 2))
     row = int(rows[int(np.argmax(shown))])
     flat = np.array([1.0, 1.0, 0.0])
     emitter = geometry.emitter * flat
@@ -69,24 +69,7 @@ def highest_contrast_row(scan: Scan, views: np.ndarray | None = None) -> Row:
         emitter = emitter / np.linalg.norm(emitter, axis=1, keepdims=True)
     centre = geometry.centre + (row - (geometry.rows - 1) / 2) * geometry.row_step
     plane = replace(geometry, emitter=emitter, centre=centre * flat, column_step=geometry.column_step * flat, rows=1)
-    return Row(plane, filled(scan, views, row)[:, 0])
-
-
-def filled(scan: Scan, views: np.ndarray, row: int | None = None) -> np.ndarray:
-    """Return line integrals (views, rows or 1, columns) with unusable pixels interpolated along their row."""
-    if row is not None:
-        scan = scan.only_rows(row, row + 1)
-    integrals = scan.line_integrals(views)
-    usable = scan.of_views("usable", views)
-    if usable is None:
-        return integrals
-    integrals = integrals.copy()
-    bad = ~np.broadcast_to(usable, integrals.shape)
-    columns = np.arange(integrals.shape[2])
-    for view, line in np.unique(np.argwhere(bad)[:, :2], axis=0):
-        good = ~bad[view, line]
-        integrals[view, line] = np.interp(columns, columns[good], integrals[view, line, good]) if good.any() else 0
-    return integrals
+    return Row(plane, scan.only_rows(row, row + 1).line_integrals(views)[:, 0])
 
 
 def misfit(row: Row, *, shift: float = 0.0, mirrored: bool = False) -> np.ndarray:

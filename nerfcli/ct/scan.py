@@ -111,9 +111,22 @@ class Scan:
     def line_integrals(self, views: np.ndarray) -> np.ndarray:
         """Return -log of the transmission of views, (len(views), rows, columns) float32, for pictures and baselines.
 
-        Smaller transmissions are raised to that of half a photon, or to 1e-4 if photons are unknown. The logarithm of
-        noise is biased, so no likelihood is computed from the result.
+        Unusable pixels are interpolated along their row; rows without a usable one are 0. Smaller transmissions are
+        raised to that of half a photon, or to 1e-4 if photons are unknown. The logarithm of noise is biased, so no
+        likelihood is computed from the result.
         """
+        integrals = self._logarithms(views)
+        usable = self.of_views("usable", views)
+        if usable is None:
+            return integrals
+        bad = ~np.broadcast_to(usable, integrals.shape)
+        columns = np.arange(integrals.shape[2])
+        for view, line in np.argwhere(bad.any(axis=2)):
+            good, values = ~bad[view, line], integrals[view, line]
+            integrals[view, line] = np.interp(columns, columns[good], values[good]) if good.any() else 0
+        return integrals
+
+    def _logarithms(self, views: np.ndarray) -> np.ndarray:
         values = np.asarray(self.values[views], dtype=np.float32)
         if self.kind == "line_integral":
             return values
