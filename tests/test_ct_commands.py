@@ -414,6 +414,10 @@ def test_other_suffixes_and_types_are_refused(tmp_path: Path) -> None:
         (("--tv", "-1"), "invalid weight"),
         (("--voxel-size", "0"), "invalid voxel size 0"),
         (("--voxel-size", "0.001"), "need .* GB of memory"),
+        (("--voxel-size", "inf"), "invalid voxel size inf"),
+        (("--centre", "nan"), "invalid --centre nan"),
+        (("--tilt", "inf"), "invalid --tilt inf"),
+        (("--centre", "1e9"), "--centre 1e\\+09 is outside the 30 columns"),
     ],
 )
 def test_train_refuses_in_two_lines(bean_run: Path, tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
@@ -421,6 +425,23 @@ def test_train_refuses_in_two_lines(bean_run: Path, tmp_path: Path, arguments: t
     assert code == 3
     assert re.search(said, err)
     assert len([line for line in err.strip().splitlines() if line.strip()]) <= 3
+
+
+def test_more_voxels_than_64_bits_can_count() -> None:
+    """Regression: their number was negative, so that any memory was enough."""
+    assert VoxelGrid((2**21, 2**21, 2**21), (0.0, 0.0, 0.0), 1.0).voxels == 2**63
+
+
+def test_few_views_and_columns_are_refused_or_checked(tmp_path: Path) -> None:
+    """Regression: tracebacks, of a scan whose views are nearly all held out, and of one cropped to a few columns."""
+    scan = scan_of(cone(9, rows=2, columns=4), held_out=tuple(range(7)))
+    save_scan(tmp_path / "scan", scan)
+    code, _, err = call("train", tmp_path / "scan", "--passes", "1")
+    assert code == 3
+    assert err.startswith(f"Error: {tmp_path / 'scan'} has 2 views that are not held out, expected 3\n")
+    assert not (tmp_path / "scan-run").exists()
+    code, out, err = call("doctor", tmp_path / "scan")
+    assert (code, out) == (0, f"{tmp_path / 'scan-doctor.html'}\n"), err
 
 
 def test_a_changed_scan_is_not_evaluated_as_the_old_one(bean_run: Path, tmp_path: Path) -> None:

@@ -112,6 +112,10 @@ def test_options_say_more_than_the_file(tmp_path: Path) -> None:
     assert circle_of(plain.geometry)[0].mirrored
 
 
+def test_a_view_that_is_stated_twice_is_held_out_once(tmp_path: Path) -> None:
+    assert read_scan(stack(tmp_path, changed={"held_out": [4, 1, 4]}).path).held_out == (1, 4)
+
+
 def test_a_scan_is_not_replaced_unless_one_says_so(tmp_path: Path) -> None:
     written = stack(tmp_path)
     out = tmp_path / "o"

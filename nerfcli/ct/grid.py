@@ -1,5 +1,6 @@
 """The voxel grid of a volume: number, position and size of its voxels."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -34,7 +35,7 @@ class VoxelGrid:
     @property
     def voxels(self) -> int:
         """Number of voxels."""
-        return int(np.prod(self.shape))
+        return math.prod(self.shape)
 
     def axis(self, name: str) -> np.ndarray:
         """Centres of the voxels along "x", "y" or "z"."""

@@ -4,6 +4,7 @@ RUN/reconstruction.json records what was fitted, how, and the decisions taken; R
 RUN/marks.npy marks the voxels that the views do not determine, see `marks`.
 """
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -57,9 +58,12 @@ class ReconstructionSettings:
             raise UserError(
                 "no stopping criterion: neither --budget nor --passes is given", "give --budget 2m or --passes 30"
             )
-        if self.voxel_size is not None and not self.voxel_size > 0:
+        if self.voxel_size is not None and not 0 < self.voxel_size < math.inf:
             raise UserError(f"invalid voxel size {self.voxel_size:g}", "give --voxel-size a length above 0")
-        if not 0 <= self.strength < float("inf"):
+        for option, value in (("--centre", self.centre), ("--tilt", self.tilt)):
+            if value is not None and not math.isfinite(value):
+                raise UserError(f"invalid {option} {value:g}", "give a finite number, or leave it out")
+        if not 0 <= self.strength < math.inf:
             raise UserError(
                 f"invalid weight of total variation: {self.strength:g}",
                 "give --tv a number of 0 or more, or leave it out",

@@ -48,6 +48,8 @@ LEAST_FRACTION = 0.25
 COARSE_PASSES = 6
 # Maximum number of passes of a fit that is limited only by time.
 MOST_PASSES = 200
+# Fewest views to fit: of fewer, none could be left out to judge the noise.
+LEAST_VIEWS = 3
 # Memory of a fit per voxel: volume, momentum, gradient, curvature, threshold, best volume and three duals, with copies.
 BYTES_OF_VOXEL = 52
 # The open beam drifts if its standard deviation between views exceeds this many standard errors.
@@ -81,6 +83,16 @@ def train_scan(
     folder = Path(scan)
     run = output.beside(folder, "-run")
     loaded = load_scan(folder)
+    if len(loaded.training_views) < LEAST_VIEWS:
+        raise UserError(
+            f"{folder} has {several(len(loaded.training_views), 'view')} that are not held out, expected {LEAST_VIEWS}",
+            "convert it again, with fewer views held out",
+        )
+    if settings.centre is not None and abs(settings.centre) > loaded.geometry.columns:
+        raise UserError(
+            f"--centre {-settings.centre:g} is outside the {loaded.geometry.columns} columns",
+            "give the columns from where the scan says that the axis is to where it is",
+        )
     earlier = load_reconstruction(run) if is_reconstruction(run) and not output.overwrite else None
     if earlier is not None:
         if reason := _reason_to_keep(run, earlier, loaded.digest, settings, resume=resume):

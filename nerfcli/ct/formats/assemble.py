@@ -227,4 +227,4 @@ def _held_out(found: ReaderOutput, given: ScanOptions, views: int) -> tuple[int,
         return tuple(sorted(int(name) for name in names_held_out(given.holdout, names)))
     if found.held_out is None:
         return held_out_views(views)
-    return tuple(sorted(int(view) for view in found.held_out))
+    return tuple(sorted({int(view) for view in found.held_out}))
