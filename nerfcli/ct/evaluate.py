@@ -114,7 +114,7 @@ def evaluate_scan(
 
     def measure(name: str, volume: np.ndarray) -> None:
         projections = score_projections(
-            scan, geometry, torch.from_numpy(np.array(volume)), result.grid, air=_held_out_air(scan, geometry, result)
+            scan, geometry, torch.from_numpy(np.array(volume)), result.grid, air=held_out_air(scan, geometry, result)
         )
         methods[name] = {
             "projections": None if projections is None else asdict(projections),
@@ -163,7 +163,7 @@ def _reference_of(run: Path, unit: str) -> Reconstruction:
     return reference
 
 
-def _held_out_air(scan: Scan, geometry: ScanGeometry, result: Reconstruction) -> np.ndarray | None:
+def held_out_air(scan: Scan, geometry: ScanGeometry, result: Reconstruction) -> np.ndarray | None:
     """Estimate the factor on the open beam of each held-out view from its pixels beside the object, as in the fit.
 
     None if the reconstruction did not use such factors.

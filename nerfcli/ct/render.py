@@ -7,8 +7,9 @@ import tifffile
 import torch
 
 from nerfcli.atomic import atomic_path
+from nerfcli.ct.evaluate import held_out_air
 from nerfcli.ct.grid import VoxelGrid
-from nerfcli.ct.likelihood import Likelihood, likelihood_of
+from nerfcli.ct.likelihood import Likelihood, Poisson, likelihood_of
 from nerfcli.ct.marks import MEANINGS, UNSEEN
 from nerfcli.ct.reconstruct import Projector
 from nerfcli.ct.result import Reconstruction, load_reconstruction, scan_of
@@ -66,8 +67,13 @@ def render_scan(
     chosen = np.array(scan.held_out, dtype=int) if views == "test" else scan.training_views
     if len(chosen) == 0:
         raise UserError(f"{run} has no held-out views", "render the training views with --cameras train")
-    geometry = scan.geometry.corrected(result.used["centre"], result.used["tilt"]).select(chosen)
+    corrected = scan.geometry.corrected(result.used["centre"], result.used["tilt"])
+    geometry = corrected.select(chosen)
     projector, likelihood = Projector(geometry, result.grid), likelihood_of(scan, chosen)
+    air = held_out_air(scan, corrected, result) if views == "test" else result.used.get("air")
+    if air is not None:
+        assert isinstance(likelihood, Poisson)
+        likelihood = likelihood.scaled(torch.as_tensor(air, dtype=torch.float32))
     volume = torch.from_numpy(np.array(result.volume))
     top = float(np.nanmax(scan.line_integrals(chosen)))
     paths = {(view, name): target / name / f"{view:04d}.tif" for view in chosen for name in outputs}
