@@ -157,7 +157,8 @@ def write_json(path: Path, content: Any) -> None:
     """Write `content` as indented JSON, atomically. NaN and infinity are refused, since JSON cannot hold them."""
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
     with atomic_path(path) as partial:
-        partial.write_text(text + "\n", encoding="utf-8")
+        # Names of files that are not UTF-8 have surrogates, whose escapes are those of JSON.
+        partial.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def read_json(path: Path, *, needed: tuple[str, ...], hint: str) -> dict[str, Any]:

@@ -109,6 +109,14 @@ def test_json_is_written_whole_and_without_nan(tmp_path):
     assert names(tmp_path) == ["a.json"]
 
 
+def test_json_of_a_path_that_is_not_utf_8_is_valid_and_comes_back(tmp_path):
+    """Regression: a traceback in a folder that was unpacked from an old archive, whose names are Latin-1."""
+    path = os.fsdecode(b"K\xfcche/photos")
+    write_json(tmp_path / "a.json", {"scene": path, "name": "Küche"})
+    assert b'"scene": "K\\udcfcche/photos"' in (tmp_path / "a.json").read_bytes()
+    assert read_json(tmp_path / "a.json", needed=(), hint="") == {"scene": path, "name": "Küche"}
+
+
 @pytest.mark.parametrize(
     "content", [b"", b"[]", b"{}", b'{"mean": 1', b"\xff\xfe", b'{"mean": "a\x00"}', b'{"nean": 1}']
 )

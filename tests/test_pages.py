@@ -2,6 +2,7 @@
 
 import base64
 import json
+import os
 import re
 from pathlib import Path
 
@@ -80,6 +81,17 @@ def test_pictures_read_back_by_another_reader():
     assert small.shape == (24, 32, 3)
     wanted = picture.reshape(24, 2, 32, 2, 3).mean((1, 3))
     assert np.abs(small[..., ::-1] - wanted).max() < 8
+
+
+def test_a_page_about_a_folder_whose_name_is_not_utf_8(tmp_path):
+    """The name is shown with an escape, in the page's data too, and the page is known again."""
+    source, path = tmp_path / os.fsdecode(b"K\xfcche"), tmp_path / "page.html"
+    body, mark = page.data_element("data", {"name": source.name}), page.Mark("test", source)
+    page.write_page(page.page_html(title=source.name, mark=mark, style="", body=body), path)
+    text = path.read_text(encoding="utf-8")
+    assert r"<title>K\udcfcche: nerfcli test</title>" in text
+    assert r'{"name":"K\udcfcche"}' in text
+    page.claim_page(Output(), path, mark, about="capture")
 
 
 def test_only_a_page_of_the_same_kind_and_source_is_replaced(tmp_path):

@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import json
+import os
 import zlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -43,7 +44,7 @@ class Mark:
 
     def html(self) -> str:
         """Return the HTML of the mark for the page's head."""
-        identity = hashlib.sha256(str(self.source.resolve()).encode()).hexdigest()[:16]
+        identity = hashlib.sha256(os.fsencode(self.source.resolve())).hexdigest()[:16]
         return f'<meta name="nerfcli-{self.kind}" content="{identity}">'
 
 
@@ -147,7 +148,8 @@ def write_page(text: str, path: Path) -> None:
         UserError: it cannot be written.
     """
     with atomic_path(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+        # Names of files that are not UTF-8 are shown with escapes.
+        partial.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def is_made_from(path: Path, origin: str) -> bool:

@@ -155,7 +155,7 @@ class _Handler(BaseHTTPRequestHandler):
             text = f"{error.message}: {error.hint}\n"
             self._send(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain; charset=utf-8", text.encode(), {"Refresh": "2"})
             return
-        self._send(HTTPStatus.OK, "text/html; charset=utf-8", text.encode())
+        self._send(HTTPStatus.OK, "text/html; charset=utf-8", text.encode(errors="backslashreplace"))
 
     def _version(self) -> None:
         self._send(HTTPStatus.OK, "application/json", json.dumps(self._of.show.version()).encode())
