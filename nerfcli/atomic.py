@@ -63,12 +63,13 @@ def atomic_path(path: Path) -> Iterator[Path]:
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Provide a temporary folder that replaces `path` on success and is removed on any exception.
 
-    A folder at `path` is replaced only in the last step; callers ask the user before.
+    A folder at `path` is replaced only in the last step; callers ask the user before. A link stays, and the folder that
+    it leads to is replaced.
 
     Raises:
         UserError: as for `atomic_path`.
     """
-    path = path.absolute()  # "." has no name
+    path = path.resolve()  # "." has no name, and a link to another disk stays
     partial = path.with_name(f".{path.name}.partial-{_own()}")
     with _write_errors_explained(path):
         try:
@@ -81,11 +82,12 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 
 def replace_folder(complete: Path, path: Path) -> None:
-    """Replace a folder by another; the old one is kept until the new one is in place.
+    """Replace a folder by another, on the same disk; the old one is kept until the new one is in place.
 
     Raises:
         UserError: it cannot be moved.
     """
+    path = path.resolve()
     old = path.with_name(f".{path.name}.old-{_own()}")
     with _write_errors_explained(path):
         try:

@@ -132,6 +132,22 @@ def test_json_of_ours_that_is_damaged_is_reported(content, tmp_path):
     assert read_json(path, needed=("mean",), hint="measure again") == {"mean": 1}
 
 
+def test_a_link_to_another_disk_stays_and_the_folder_behind_it_is_replaced(tmp_path):
+    """Regression: the link was moved aside and never removed, and the results were written where it had been."""
+    big, place = tmp_path / "big", tmp_path / "small" / "renders"
+    (big / "renders").mkdir(parents=True)
+    (big / "renders" / "old.txt").write_text("old")
+    place.parent.mkdir()
+    place.symlink_to(big / "renders")
+    for content in ("first", "second"):
+        with atomic_folder(place) as partial:
+            assert partial.parent == big
+            (partial / f"{content}.txt").write_text(content)
+        assert place.is_symlink()
+        assert names(place) == [f"{content}.txt"]
+        assert names(big) == names(place.parent) == ["renders"]
+
+
 # Leftovers of killed processes
 
 

@@ -83,7 +83,8 @@ def render_job(
         raise UserError(
             f"--frames selects none of the {len(frames)} views", f"give a part of 0:{len(frames)}, or K/N", exit_code=2
         )
-    unfinished = _Unfinished(folder.with_name(f".{folder.name}.unfinished-{job.digest}"))
+    place = folder.resolve() if folder.is_symlink() else folder  # a link may lead to another disk
+    unfinished = _Unfinished(place.with_name(f".{folder.name}.unfinished-{job.digest}"))
     if job.is_kept_in(folder, output):
         reporter.note(f"{folder} is kept: it is complete and has these settings; add --overwrite to render again")
         clear_leftovers(folder.parent)
