@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 
@@ -25,6 +26,18 @@ from nerfcli.splats.files import write_splats
 from nerfcli.splats.gaussians import Gaussians
 
 info = partial(nerfcli, "info")
+
+
+def test_a_depth_file_is_described_without_torch(tmp_path):
+    """Regression: the facts about meshes loaded what makes them, 3 of 5 seconds of the command."""
+    write_png16(tmp_path / "a.png", np.ones((2, 2), np.float32), META, units_per_level=1e-3)
+    program = (
+        "import sys; from nerfcli.cli import app\n"
+        f"try: app(['info', {str(tmp_path / 'a.png')!r}])\n"
+        "finally: print(*{'torch', 'skimage'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == ""
 
 
 def test_facts_fit_the_lines_of_a_terminal():

@@ -19,7 +19,8 @@ from nerfcli.export import extent
 from nerfcli.export.depth_views import DepthView, normals_of, plane_rays, point_colours, surface_colours
 from nerfcli.export.extent import Grid, SurfaceSettings, scene_box
 from nerfcli.export.fusion import FusedVolume, agreed_points, fuse
-from nerfcli.export.meshes import mesh_of, read_glb_json, simplified, surface_of, without_small_pieces, write_glb
+from nerfcli.export.mesh_facts import read_glb_json
+from nerfcli.export.meshes import mesh_of, simplified, surface_of, without_small_pieces, write_glb
 from nerfcli.photos.loading import pinhole_of, undistorted
 from nerfcli.ply import read_ply_header, read_ply_mesh, read_ply_vertices, write_ply
 from nerfcli.render.model import Model, save_model

@@ -1,9 +1,9 @@
-"""Meshes: marching cubes over signed distances, simplification; GLB and OBJ files, and the facts that files state."""
+"""Meshes: marching cubes over signed distances, simplification; GLB and OBJ files."""
 
 import json
 import struct
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,10 @@ from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
 from nerfcli.atomic import atomic_path
-from nerfcli.errors import UserError
 from nerfcli.export.fusion import SIDE, FusedVolume
+from nerfcli.export.mesh_facts import GLB_JSON
 from nerfcli.photos.colours import linear_light
-from nerfcli.ply import comments_of, description_in, read_ply_header, read_ply_mesh, write_ply
+from nerfcli.ply import comments_of, read_ply_mesh, write_ply
 
 # Voxels along a side of a brick, the unit of marching.
 _BRICK = 8 * SIDE
@@ -149,9 +149,9 @@ def simplified(mesh: Mesh, faces: int, *, threads: int) -> Mesh:
     return mesh_of(vertices.astype(np.float64) + middle, triangles)
 
 
-# Component types and chunk types of glTF 2.0.
+# Component types of glTF 2.0, and the type of its binary chunk.
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
-_JSON, _BINARY = 0x4E4F534A, 0x004E4942
+_BINARY = 0x004E4942
 # Float positions are stored relative to their mean if it is at least this many times their extent from the origin.
 _FAR = 1000.0
 
@@ -248,99 +248,6 @@ def write_glb(
     text += b" " * (-len(text) % 4)
     binary = b"".join(parts)
     binary += b"\0" * (-len(binary) % 4)
-    chunks = struct.pack("<II", len(text), _JSON) + text + struct.pack("<II", len(binary), _BINARY) + binary
+    chunks = struct.pack("<II", len(text), GLB_JSON) + text + struct.pack("<II", len(binary), _BINARY) + binary
     with atomic_path(path) as partial:
         partial.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
-
-
-def read_glb_json(path: Path) -> dict[str, Any]:
-    """Read the JSON of a binary glTF.
-
-    Raises:
-        UserError: it is not a binary glTF, or truncated.
-    """
-    data = path.read_bytes()
-    try:
-        magic, version, length = struct.unpack_from("<4sII", data)
-        size, kind = struct.unpack_from("<II", data, 12)
-        if magic != b"glTF" or version != 2 or length > len(data) or kind != _JSON:
-            raise ValueError("its header is not that of glTF 2.0")
-        content = json.loads(data[20 : 20 + size])
-    except (struct.error, ValueError) as error:
-        raise UserError(f"{path} is not a GLB file, or is truncated: {error}", "export it again") from error
-    return content
-
-
-# Note for files without a description.
-NOT_STATED = "unit and frame"
-SUFFIXES = (".ply", ".glb", ".obj")
-
-
-def is_splat_file(path: Path) -> bool:
-    """Return whether a file is a .spz, or a .ply whose points have colours by direction.
-
-    Raises:
-        UserError: the header of a .ply is damaged.
-    """
-    suffix = path.suffix.lower()
-    if not path.is_file() or suffix not in (".spz", ".ply"):
-        return False
-    return suffix == ".spz" or "f_dc_0" in read_ply_header(path).vertex_properties
-
-
-def model_facts(path: Path) -> dict[str, Any]:
-    """Return the facts about a file: kind, format, counts, and what nerfcli wrote into it: unit, frame, run, ...
-
-    Raises:
-        UserError: the file is missing or damaged.
-    """
-    if not path.is_file():
-        raise UserError(f"{path} does not exist", "give a file that exists")
-    match path.suffix.lower():
-        case ".ply":
-            header = read_ply_header(path)
-            counts = _counts("PLY", header.count("vertex"), header.count("face") or None)
-            return {**_described(header.comments), **counts, "properties": " ".join(header.vertex_properties)}
-        case ".glb":
-            return _glb_facts(path)
-        case _:
-            return _obj_facts(path)
-
-
-def _glb_facts(path: Path) -> dict[str, Any]:
-    content = read_glb_json(path)
-    described = content.get("asset", {}).get("extras") or {"not_stated": NOT_STATED}
-    try:
-        primitive = content["meshes"][0]["primitives"][0]
-        positions = content["accessors"][primitive["attributes"]["POSITION"]]
-        faces = content["accessors"][primitive["indices"]]["count"] // 3
-        return {
-            **described,
-            **_counts("GLB", positions["count"], faces),
-            "low": positions["min"],
-            "high": positions["max"],
-        }
-    except (KeyError, IndexError, TypeError):  # written by another program: it may contain anything
-        return {**described, "kind": "mesh", "format": "GLB", "note": "its first mesh has no list of triangles"}
-
-
-def _obj_facts(path: Path) -> dict[str, Any]:
-    counts, comments = {"v": 0, "f": 0}, []
-    with path.open(encoding="utf-8", errors="replace") as file:
-        for line in file:
-            word = line.partition(" ")[0]
-            if word in counts:
-                counts[word] += 1
-            elif word == "#":
-                comments.append(line[1:].strip())
-    if not counts["v"]:
-        raise UserError(f"{path} has no vertices", "copy or export it again")
-    return {**_described(comments), **_counts("OBJ", counts["v"], counts["f"])}
-
-
-def _counts(form: str, vertices: int, faces: int | None) -> dict[str, Any]:
-    return {"kind": "mesh" if faces else "points", "format": form, "vertices": vertices, "faces": faces}
-
-
-def _described(comments: Sequence[str]) -> dict[str, Any]:
-    return description_in(comments) or {"not_stated": NOT_STATED}

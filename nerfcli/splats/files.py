@@ -10,7 +10,7 @@ import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
 
 from nerfcli.errors import UserError, listed, several
-from nerfcli.export.meshes import NOT_STATED
+from nerfcli.export.mesh_facts import NOT_STATED
 from nerfcli.pages.page import Mark, array_element, asset, data_element, page_html, write_page
 from nerfcli.ply import description_in, ply_bytes, read_ply_header, read_ply_vertices, write_ply
 from nerfcli.splats.gaussians import Gaussians

@@ -19,8 +19,8 @@ from nerfcli.captures.formats.run_cameras import CAMERAS
 from nerfcli.captures.loading import describe_unused_masks, fingerprint, with_photos_on_disk
 from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.errors import UserError
-from nerfcli.export.meshes import SUFFIXES as MODEL_SUFFIXES
-from nerfcli.export.meshes import is_splat_file, model_facts
+from nerfcli.export.mesh_facts import SUFFIXES as MODEL_SUFFIXES
+from nerfcli.export.mesh_facts import is_splat_file, model_facts
 from nerfcli.render.files.file_facts import RENDERS, file_facts, renders_facts
 from nerfcli.training.runs.files import CONFIG, DEPTH_ERRORS, LOG, METRICS, REPORT
 
