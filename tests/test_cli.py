@@ -49,6 +49,7 @@ from nerfcli.training.runs import settings
 from nerfcli.training.runs.files import append_log, read_log
 from nerfcli.training.runs.run import load_run
 from nerfcli.workflows import pipeline
+from nerfcli.workflows.splats import file_digest
 
 BATCH_COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench", "export")
 COMMANDS = (*BATCH_COMMANDS, "view")
@@ -899,6 +900,11 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
     before = listing(run)
     assert nerfcli(*arguments).exit_code == 0  # a smaller budget than that of the training, which is kept
     assert listing(run) == before
+    assert nerfcli("export", run, "--to", "splats", "--sh", "1", "--budget", "0.1s", "--overwrite").exit_code == 0
+    refined = nerfcli(*arguments)
+    assert refined.exit_code == 0, refined.stderr
+    made = json.loads((run / "renders" / "orbit-conditional-z-splats" / "render.json").read_text())
+    assert made["splats_sha256"] == file_digest(tmp_path / "all" / "run-splats.ply")
 
 
 # Processes of their own

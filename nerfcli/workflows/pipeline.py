@@ -169,7 +169,9 @@ class _Results:
     def pictures(self, views: Views, settings: RenderSettings, *, splats: Path | None = None) -> list[Path]:
         """Render views of the splats, or else of the field."""
         run, name = self.run.path, folder_name(views, settings, of_splats=splats is not None)
-        output = self._replacing(run / RENDERS / name / DESCRIPTION, "field_sha256", self.run.checkpoint_sha256())
+        key = "field_sha256" if splats is None else "splats_sha256"
+        made_from = self.run.checkpoint_sha256() if splats is None else file_digest(splats)
+        output = self._replacing(run / RENDERS / name / DESCRIPTION, key, made_from)
         what = {"views": views, "settings": settings, "splats": splats}
         with self.reporter.stage(f"render {views.name}") as stage:
             written = render_run(run, output, **what, resources=self.resources, reporter=stage)
