@@ -1,11 +1,12 @@
 """Threads, devices, memory and processes of this machine; everything that depends on the operating system is here."""
 
 import ctypes
+import math
 import os
 import platform
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,8 @@ from nerfcli.errors import UserError
 
 # Fraction of the memory of the machine or container; the rest is for other processes and the file cache.
 _DEFAULT_FRACTION = 0.8
-_CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+# The control groups of this process (Linux), and where they are.
+_OWN_GROUPS, _GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 # Parameters of glibc's mallopt, and thresholds: arrays of this size, and free memory beyond this, are always returned.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 _RETURNED_ARRAY, _RETURNED_REST = 2**30, 2**31 - 1
@@ -86,13 +88,35 @@ def local_rank_and_size() -> tuple[int, int]:
 def thread_count(threads: int) -> int:
     """Return the number of CPU threads to use: as given or, for 0, the number of processors this process may run on.
 
-    The processors are divided among the processes that torchrun has started on this machine.
+    A limit on processor time counts as fewer processors. They are divided among the processes that torchrun has started
+    on this machine.
     """
     if threads:
         return threads
     # Not every system has sched_getaffinity.
     processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    for text in _limits_of_groups("cpu.max"):
+        quota, _, period = text.partition(" ")
+        if quota.isdecimal():
+            processors = min(processors, math.ceil(int(quota) / int(period)))
     return max(1, processors // local_rank_and_size()[1])
+
+
+def _limits_of_groups(name: str, controller: str = "") -> Iterator[str]:
+    """Yield a limit of this process's control group and of those around it, as containers, Slurm and systemd set them.
+
+    Args:
+        name: of the file of the limit.
+        controller: of version 1; in version 2 there is one hierarchy for all.
+    """
+    lines = _OWN_GROUPS.read_text().splitlines() if _OWN_GROUPS.exists() else []
+    for _, controllers, group in (line.split(":", 2) for line in lines):
+        if controller in controllers.split(","):
+            place = _GROUPS / controller / group.lstrip("/")
+            for folder in (place, *place.parents):
+                if folder.is_relative_to(_GROUPS / controller):
+                    with suppress(OSError):  # it sets no limit
+                        yield (folder / name).read_text().strip()
 
 
 def device_name(device: str) -> str:
@@ -149,7 +173,7 @@ def is_running(process: int) -> bool:
 
 
 def default_memory_limit(device: str = "cpu") -> int | None:
-    """Return four fifths of the memory of the machine or container, in bytes.
+    """Return four fifths of the memory of the machine or, where it has a limit, of the container or job, in bytes.
 
     None for a GPU, whose free memory may all be used.
     """
@@ -158,11 +182,9 @@ def default_memory_limit(device: str = "cpu") -> int | None:
     if device != "cpu":
         return None
     total = psutil.virtual_memory().total
-    for path in _CGROUP_LIMITS:
-        try:
-            total = min(total, int(Path(path).read_text()))
-        except (OSError, ValueError):  # no such file, or the word "max"
-            continue
+    for text in (*_limits_of_groups("memory.max"), *_limits_of_groups("memory.limit_in_bytes", "memory")):
+        if text.isdecimal():  # otherwise "max"
+            total = min(total, int(text))
     return int(_DEFAULT_FRACTION * total)
 
 

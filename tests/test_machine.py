@@ -2,19 +2,21 @@
 
 import ctypes
 import json
+import os
 import subprocess
 import sys
 from types import SimpleNamespace
 
+import psutil
 import pytest
 import torch
 from commands import nerfcli
 
-from nerfcli import kernels
+from nerfcli import kernels, machine
 from nerfcli.bench import measurement
 from nerfcli.errors import UserError
 from nerfcli.kernels import describe_machine
-from nerfcli.machine import device_name, keep_freed_memory, return_freed_memory
+from nerfcli.machine import default_memory_limit, device_name, keep_freed_memory, return_freed_memory, thread_count
 from nerfcli.training.runs.settings import TrainSettings, sizes_for
 
 
@@ -80,6 +82,39 @@ def test_info_shows_this_machine():
     lines = nerfcli("info", "--machine").stdout.splitlines()
     assert f"torch: {torch.__version__}" in lines
     assert json.loads(nerfcli("info", "--machine", "--json").stdout)["torch"] == torch.__version__
+
+
+@pytest.mark.parametrize(
+    ("own", "limits", "processors", "memory"),
+    [
+        ("0::/", {"cpu.max": "max 100000", "memory.max": "max"}, None, None),
+        ("0::/", {"cpu.max": "150000 100000", "memory.max": "1000000"}, 2, 800_000),  # in a container
+        (
+            "0::/system.slice/slurm/job_7/step_0",
+            {
+                "system.slice/slurm/job_7/step_0/memory.max": "max",
+                "system.slice/slurm/job_7/memory.max": "3000000",
+                "system.slice/memory.max": "9000000",
+                "system.slice/slurm/job_7/cpu.max": "100000 100000",
+            },
+            1,
+            2_400_000,
+        ),
+        ("7:memory:/job\n0::/", {"memory/job/memory.limit_in_bytes": "500000"}, None, 400_000),
+    ],
+    ids=["none", "container", "slurm", "version 1"],
+)
+def test_limits_of_containers_and_jobs_count(own, limits, processors, memory, monkeypatch, tmp_path):
+    """Regression: only those of containers did; a job with 8 GB of a large machine was killed."""
+    (tmp_path / "own").write_text(own + "\n")
+    for name, text in limits.items():
+        (tmp_path / "groups" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "groups" / name).write_text(text + "\n")
+    monkeypatch.setattr(machine, "_OWN_GROUPS", tmp_path / "own")
+    monkeypatch.setattr(machine, "_GROUPS", tmp_path / "groups")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(64)), raising=False)
+    assert thread_count(0) == (processors or 64)
+    assert default_memory_limit() == (memory or int(0.8 * psutil.virtual_memory().total))
 
 
 _MEGABYTE = 2**20
