@@ -286,5 +286,5 @@ def out_of_memory_explained() -> Iterator[None]:
         text = str(error).lower()
         if not isinstance(error, MemoryError) and "not enough memory" not in text and "out of memory" not in text:
             raise
-        hint = "use --downscale 4, smaller pictures (--max-size) or fewer photos"
+        hint = "use --downscale 4, smaller pictures (--max-size) or fewer photos; of scans, a larger --voxel-size"
         raise UserError("out of memory", hint, OUT_OF_MEMORY) from error

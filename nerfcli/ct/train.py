@@ -34,7 +34,7 @@ from nerfcli.ct.result import (
     save_reconstruction,
 )
 from nerfcli.ct.scan import Scan, load_scan
-from nerfcli.errors import UserError, duration, listed, several
+from nerfcli.errors import OUT_OF_MEMORY, UserError, duration, listed, several
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.machine import default_memory_limit, thread_count, use_threads
 from nerfcli.notices import Progress, Reporter
@@ -348,4 +348,5 @@ def _fits_memory(grid: VoxelGrid) -> None:
         raise UserError(
             f"{size} voxels need {needed / 1e9:.1f} GB of memory; the limit is {limit / 1e9:.1f} GB",
             f"choose larger voxels with --voxel-size (now {grid.size:.3g})",
+            OUT_OF_MEMORY,
         )
