@@ -65,7 +65,6 @@ def filtered_back_projection(geometry: ScanGeometry, integrals: np.ndarray, grid
 
     z, y, x = (torch.from_numpy(grid.axis(name)) for name in "zyx")
     volume = torch.zeros(grid.shape)
-    turn = np.pi if geometry.beam == "parallel" and _turn(outward) < 1.5 * np.pi else 2 * np.pi
     for view in range(geometry.views):
         direction = outward[view] / radius
         if geometry.beam == "cone":
@@ -91,7 +90,7 @@ def filtered_back_projection(geometry: ScanGeometry, integrals: np.ndarray, grid
             picture, place.reshape(1, -1, 1, 2).float(), mode="bilinear", padding_mode="zeros", align_corners=False
         )
         volume += seen.view(grid.shape) / depth.square().float()
-    return volume * (turn / geometry.views) * (1.0 if turn < 1.5 * np.pi else 0.5)
+    return volume * (np.pi / geometry.views)  # over a full turn, each line is measured from both of its ends
 
 
 def filtered_misfit(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGrid, volume: Tensor) -> float:
@@ -147,12 +146,6 @@ def _ramp(projections: np.ndarray, width: float) -> np.ndarray:
     kernel[odd] = -1 / (np.pi * place[odd] * width) ** 2
     response = np.fft.rfft(np.fft.ifftshift(kernel))
     return np.fft.irfft(np.fft.rfft(projections, length) * response, length)[..., :count] * width
-
-
-def _turn(outward: np.ndarray) -> float:
-    """Return the angle that the views span, plus one step."""
-    angle = np.unwrap(np.arctan2(outward[:, 1], outward[:, 0]))
-    return float(abs(angle[-1] - angle[0]) * len(angle) / max(len(angle) - 1, 1))
 
 
 def _check_circle(geometry: ScanGeometry, outward: np.ndarray) -> None:
