@@ -59,14 +59,12 @@ class Fit:
         volume: (Z, Y, X) attenuation, float32.
         dual: (3, Z, Y, X) dual variable of its total variation.
         passes: number of passes over all views so far.
-        seconds: seconds spent so far.
         settled: whether the last pass changed the volume by at most `SETTLED`.
     """
 
     volume: Tensor
     dual: Tensor
     passes: int = 0
-    seconds: float = 0.0
     settled: bool = False
 
 
@@ -121,7 +119,7 @@ def mean_attenuation(problem: Problem) -> float:
 def finer(fit: Fit, grid: VoxelGrid) -> Fit:
     """Interpolate a fit onto another grid over the same box, with a dual of 0; its passes are counted anew."""
     volume = interpolate(fit.volume[None, None], grid.shape, mode="trilinear")[0, 0]
-    return Fit(volume, torch.zeros(3, *grid.shape), seconds=fit.seconds)
+    return Fit(volume, torch.zeros(3, *grid.shape))
 
 
 def reconstruct(
@@ -194,11 +192,11 @@ def reconstruct(
         settled = float((volume - before).norm()) <= SETTLED * max(float(volume.norm()), 1e-30)
         spent = time.perf_counter() - begun
         if keep is not None:
-            keep(Fit(volume, dual, fit.passes + done, fit.seconds + spent, settled))
+            keep(Fit(volume, dual, fit.passes + done, settled))
         over = (passes is not None and done >= passes) or (seconds is not None and spent * (done + 1) / done > seconds)
         if over or (settled and done > 1):
             break
-    return Fit(volume, dual, fit.passes + done, fit.seconds + time.perf_counter() - begun, settled)
+    return Fit(volume, dual, fit.passes + done, settled)
 
 
 def curvature_bound(problem: Problem, strength: float) -> tuple[Tensor, float]:
