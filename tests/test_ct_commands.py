@@ -17,7 +17,6 @@ from scan_of_phantom import phantom_circle, scan_of_phantom
 from test_reconstruct import cone, scan_of
 from typer.testing import CliRunner
 
-from nerfcli.atomic import read_sealed, write_sealed
 from nerfcli.cli import app
 from nerfcli.ct.evaluate import score_projections, score_volume
 from nerfcli.ct.export import VolumeFile, export_scan, read_volume, write_volume
@@ -26,7 +25,6 @@ from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.grid import VoxelGrid, centred_grid
 from nerfcli.ct.likelihood import Gaussian, Poisson
 from nerfcli.ct.marks import UNSEEN, marks
-from nerfcli.ct.recognise import DESCRIPTION
 from nerfcli.ct.render import residual_of, slice_of
 from nerfcli.ct.result import ReconstructionSettings, load_reconstruction, save_reconstruction
 from nerfcli.ct.result import scan_of as scan_behind
@@ -80,14 +78,6 @@ def test_train_says_what_it_decided_and_keeps_a_run(bean_run: Path) -> None:
     code, _, err = call("train", scan, "--passes", "9")
     assert code == 3
     assert "another reconstruction" in err
-
-
-def test_a_weight_that_an_earlier_version_chose_is_read(bean_run: Path, tmp_path: Path) -> None:
-    run = shutil.copytree(bean_run, tmp_path / "run")
-    content = read_sealed(run / DESCRIPTION)
-    content["settings"]["strength"], content["used"]["strength"] = None, 0.3
-    write_sealed(run / DESCRIPTION, content)
-    assert load_reconstruction(run).settings.strength == 0.3
 
 
 def test_evaluate_compares_with_other_methods(bean_run: Path) -> None:
@@ -301,19 +291,6 @@ def test_scores_that_do_not_exist_are_none() -> None:
     assert score_projections(replace(scan, usable=usable), scan.geometry, torch.zeros(grid.shape), grid) is None
     small = np.ones(grid.shape)
     assert score_volume(small, grid, small, grid).ssim is None
-
-
-def test_a_hash_grid_of_an_earlier_version_is_refused(bean_run: Path, tmp_path: Path) -> None:
-    run = shutil.copytree(bean_run, tmp_path / "run")
-    content = read_sealed(run / DESCRIPTION)
-    content["settings"] |= {"field": "voxels", "seed": 0}
-    write_sealed(run / DESCRIPTION, content)
-    assert load_reconstruction(run).settings == load_reconstruction(bean_run).settings
-    content["settings"]["field"] = "hash"
-    write_sealed(run / DESCRIPTION, content)
-    code, _, err = call("evaluate", run)
-    assert code == 3
-    assert err.splitlines()[0] == (f"Error: {run} is a hash grid by an earlier version, which this version cannot read")
 
 
 @pytest.mark.parametrize(

@@ -157,15 +157,7 @@ def load_reconstruction(run: Path) -> Reconstruction:
     try:
         content = read_sealed(run / DESCRIPTION)
         arrays = {name: read_array(run / name, digest) for name, digest in content["arrays"].items()}
-        grid, settings = content["grid"], content["settings"]
-        settings.pop("seed", None)  # of earlier runs
-        if settings.pop("field", "voxels") != "voxels":
-            raise UserError(
-                f"{run} is a hash grid by an earlier version, which this version cannot read",
-                "train the scan again, into another folder: voxels are better in the same time",
-            )
-        if settings["strength"] is None:  # earlier runs could choose it
-            settings["strength"] = content["used"]["strength"]
+        grid = content["grid"]
         return Reconstruction(
             arrays.pop(VOLUME),
             arrays.pop(MARKS),
@@ -173,7 +165,7 @@ def load_reconstruction(run: Path) -> Reconstruction:
             content["unit"],
             Path(content["scan"]),
             content["scan_digest"],
-            ReconstructionSettings(**settings),
+            ReconstructionSettings(**content["settings"]),
             content["used"],
             tuple(content["decisions"]),
             content["passes"],
@@ -181,7 +173,7 @@ def load_reconstruction(run: Path) -> Reconstruction:
             content["settled"],
             content["missing_wedge_deg"],
             content["versions"],
-            complete=content.get("complete", True),  # earlier runs do not say
+            content["complete"],
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{run} cannot be read as a reconstruction: {error}", "train the scan again") from error
