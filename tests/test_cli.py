@@ -507,12 +507,19 @@ def test_results_of_inputs_of_one_name_do_not_replace_each_other(monkeypatch, tm
     assert written == [tmp_path / name for name in names]  # the last one is the same input again
     assert error_of(result)[0].endswith("is the result of a/kitchen, which has the same name")
 
-    def only_asked(photos: Path, output: Output, **more: object) -> None:
+    def only_asked(*given: object, **more: object) -> None:
         raise UserError("enough", "of this test")
 
     monkeypatch.setattr("nerfcli.workflows.pipeline.run_pipeline", only_asked)
-    result = nerfcli("run", "-", "-o", tmp_path, stdin="a/kitchen\nb/kitchen\n")
-    assert "is the result of a/kitchen, which has the same name" in result.stderr
+    monkeypatch.setattr("nerfcli.workflows.convert.convert_capture", only_asked)
+    monkeypatch.setattr("nerfcli.ct.convert.convert_scan", only_asked)
+    for arguments in (
+        ("run", "-", "-o", tmp_path),
+        ("convert", "-", tmp_path, "--to", "tum"),
+        ("ct", "convert", "-", tmp_path),
+    ):
+        result = nerfcli(*arguments, stdin="a/kitchen\nb/kitchen\n")
+        assert "is the result of a/kitchen, which has the same name" in result.stderr
 
 
 def test_a_batch_goes_on_after_paths_that_cannot_be_opened(finished, tmp_path):

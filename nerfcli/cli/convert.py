@@ -10,6 +10,7 @@ import typer
 from nerfcli.cli.batch import Given, for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Overwrite, Printing, one_of
+from nerfcli.output import beside
 
 if TYPE_CHECKING:
     from nerfcli.captures.conversion import ConventionOverrides, TargetOptions
@@ -248,7 +249,7 @@ def convert(
     def work(given: Given) -> None:
         done, record = convert_capture(
             given.path,
-            target / named_for(given.path).resolve().name if given.one_of_many else target,
+            place_of(given, target),
             wanted,
             given=read.given(),
             overrides=overrides,
@@ -314,8 +315,19 @@ def _pixel_centre(text: str | None, option: str) -> float | None:
     return None if text is None else PIXEL_CENTRES[one_of(text, PIXEL_CENTRES, option)]
 
 
-def named_for(path: Path) -> Path:
-    """Return what a result is named after: a file without suffix, or its folder if its name tells nothing."""
-    if not os.path.isfile(path):
-        return path
-    return path.parent if path.stem in COMMON_STEMS else path.with_suffix("")
+def place_of(given: Given, target: Path) -> Path:
+    """Return where an input is converted to: of several, to a path in the folder `target` that is named after it.
+
+    This is a file's name without suffix, or that of its folder if its own tells nothing.
+
+    Raises:
+        UserError: another input has this name.
+    """
+    if not given.one_of_many:
+        return target
+    named = given.path
+    if os.path.isfile(named):
+        named = named.parent if named.stem in COMMON_STEMS else named.with_suffix("")
+    place = target / beside(named, "").name
+    given.refuse_taken(place)
+    return place

@@ -11,14 +11,14 @@ import typer
 from nerfcli.cli import options
 from nerfcli.cli.batch import Given, for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.convert import named_for
+from nerfcli.cli.convert import place_of
 from nerfcli.cli.doctor import GATES, Gate, check_gate, show_findings
 from nerfcli.cli.info import show_facts
 from nerfcli.cli.options import Json, Overwrite, Printing, Writing, holdout_rule, one_of
 from nerfcli.ct.recognise import OWN, recognise
 from nerfcli.errors import UserError, in_shell
 from nerfcli.machine import thread_count
-from nerfcli.output import Output, beside
+from nerfcli.output import Output
 
 if TYPE_CHECKING:
     from nerfcli.ct.detect import Judgement
@@ -101,12 +101,11 @@ def convert(
     def work(given: Given) -> None:
         from nerfcli.ct.convert import convert_scan
 
-        path = given.path
         if target is None:
-            _detect(path, statements, console)
+            _detect(given.path, statements, console)
             return
-        place = target / beside(named_for(path), "").name if given.one_of_many else target
-        record = convert_scan(path, Output(place, overwrite), given=statements, reporter=console.reporter)
+        place = place_of(given, target)
+        record = convert_scan(given.path, Output(place, overwrite), given=statements, reporter=console.reporter)
         console.result(place, record)
 
     for_each_input(source, work, command="ct convert")
