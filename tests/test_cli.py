@@ -815,9 +815,9 @@ def test_run_holds_out_what_is_asked_of_a_capture_and_refuses_options_of_poses(m
         raise UserError("enough", "of this test")
 
     monkeypatch.setattr("nerfcli.workflows.pipeline.train_scene", only_asked)
-    for more in ((), ("--holdout", "block:0.15")):
+    for more in ((), ("--holdout", "block:0.15"), ("--holdout", "every:8")):
         nerfcli("run", capture, *more)
-    assert rules == [None, "block:0.15"]
+    assert rules == [None, "block:0.15", "every:8"]  # regression: what is usual without poses was ignored
     for more in (("--frames", "9"), ("--quality", "best"), ("--subfolders",)):
         refused = nerfcli("run", capture, *more)
         assert refused.exit_code == 2

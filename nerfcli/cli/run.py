@@ -76,6 +76,7 @@ def run(
             training=settings,
             frames=taken.frames,
             intrinsics=taken.intrinsics,
+            holdout=options.holdout_rule(taken.holdout),
             resources=training.resources,
             reporter=console.reporter,
             show=show,

@@ -8,7 +8,6 @@ from pathlib import Path
 from nerfcli.atomic import read_json
 from nerfcli.captures.archives import unpacked
 from nerfcli.captures.formats.registry import recognised
-from nerfcli.captures.holdout import DEFAULT_HOLDOUT
 from nerfcli.errors import UserError
 from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
@@ -58,6 +57,7 @@ def run_pipeline(
     training: TrainSettings | None = None,
     frames: int | None = None,
     intrinsics: Path | None = None,
+    holdout: str | None = None,
     resources: Resources = Resources(),
     reporter: Reporter = Reporter(),
     show: Callable[[Path | Evaluation], None] = lambda result: None,
@@ -76,6 +76,7 @@ def run_pipeline(
             budget of the training.
         frames: number of frames to use from a video; None for 120.
         intrinsics: file with intrinsics of the cameras, which are kept; None to estimate them.
+        holdout: photos of a capture with poses to hold out, as for `train_scene`; of others, `poses` says which.
         resources: threads, device and memory of all stages.
         reporter: receives messages, stage by stage.
         show: called with each result as soon as it is complete.
@@ -106,7 +107,7 @@ def run_pipeline(
             Output(run_path, again),
             settings,
             resume=None,
-            holdout=poses.holdout if capture is not None and poses.holdout != DEFAULT_HOLDOUT else None,
+            holdout=None if capture is None else holdout,
             resources=resources,
             reporter=stage,
         )
