@@ -245,6 +245,22 @@ def test_an_interrupt_saves_the_splats_and_writes_no_file(run: Path, monkeypatch
     assert told[-1] == "the splats are saved; to continue, add --resume to the same command"
 
 
+def test_splats_of_a_run_in_a_read_only_folder_are_exported(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: they were refined, and then lost, because they could not be kept in the run."""
+
+    def refuse(path: Path, splats: object) -> None:
+        raise UserError(f"cannot write {path}: Read-only file system", "free it")
+
+    monkeypatch.setattr("nerfcli.workflows.splats.save_splats", refuse)
+    told: list[str] = []
+    other = replace(SMALL, count=700, budget_seconds=0.2)
+    nerfcli.export_run(
+        run, Output(run.with_name("r.ply")), to="splats", splats=other, reporter=Reporter(note=told.append)
+    )
+    assert f"the splats are not kept in the run: cannot write {run / SPLATS}: Read-only file system" in told
+    assert len(nerfcli.load_splats(run.with_name("r.ply")).gaussians) <= 700
+
+
 def test_splats_are_measured_by_the_protocol_of_fields(run: Path) -> None:
     """The number in the file is that of the picture that `render` writes."""
     ply = run.with_name("spheres-run-splats.ply")

@@ -181,10 +181,14 @@ def run_splats(run: Run, model: Model, *, settings: SplatSettings, reporter: Rep
             is_ended=lambda: interrupts.came is not None,
             notify=reporter.note,
         )
-        save_splats(run.path / SPLATS, splats)
-        if interrupts.came is not None:
-            again = "run" if settings.resume is None else "add --resume to"
-            reporter.note(f"the splats are saved; to continue, {again} the same command")
+        try:
+            save_splats(run.path / SPLATS, splats)
+        except UserError as error:  # the splats of runs in read-only folders can be exported, too
+            reporter.note(f"the splats are not kept in the run: {error.message}")
+        else:
+            if interrupts.came is not None:
+                again = "run" if settings.resume is None else "add --resume to"
+                reporter.note(f"the splats are saved; to continue, {again} the same command")
         interrupts.raise_if_pending()
     reporter.note(compared_in_words(model, loaded, splats))
     return splats
