@@ -423,6 +423,17 @@ def test_more_voxels_than_64_bits_can_count() -> None:
     assert VoxelGrid((2**21, 2**21, 2**21), (0.0, 0.0, 0.0), 1.0).voxels == 2**63
 
 
+def test_metrics_that_cannot_be_written_are_refused_before_they_are_measured(
+    bean_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = shutil.copytree(bean_run, tmp_path / "run")
+    (run / "metrics.json").unlink(missing_ok=True)
+    monkeypatch.setattr("nerfcli.atomic.os.access", lambda path, mode: False)
+    monkeypatch.setattr("nerfcli.ct.evaluate.scan_of", lambda result, run: pytest.fail("it was read"))
+    code, _, err = call("evaluate", run)
+    assert (code, err.splitlines()[0]) == (3, f"Error: cannot write {run / 'metrics.json'}: no write permission")
+
+
 def test_few_views_and_columns_are_refused_or_checked(tmp_path: Path) -> None:
     """Regression: tracebacks, of a scan whose views are nearly all held out, and of one cropped to a few columns."""
     scan = scan_of(cone(9, rows=2, columns=4), held_out=tuple(range(7)))

@@ -9,7 +9,7 @@ import torch
 from scipy.ndimage import map_coordinates
 from skimage.metrics import structural_similarity
 
-from nerfcli.atomic import read_json, write_json
+from nerfcli.atomic import read_json, refuse_read_only, write_json
 from nerfcli.ct.baselines import filtered_back_projection, logarithms, sart_total_variation
 from nerfcli.ct.calibrate import air_factors
 from nerfcli.ct.geometry import ScanGeometry
@@ -107,6 +107,7 @@ def evaluate_scan(
         if kept.get("scan_digest") == result.scan_digest and kept.get("passes") == result.passes:
             reporter.note(f"{path} is kept; add --overwrite to measure again")
             return ScanEvaluation(path, kept, True)
+    refuse_read_only(path)
     scan = scan_of(result, run)
     geometry = scan.geometry.corrected(result.used["centre"], result.used["tilt"])
     truth = load_truth(scan.history)
