@@ -12,11 +12,19 @@ from fog import fog, foggy_cells
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.framing import equirectangular
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_vector
 from nerfcli.errors import UserError
 from nerfcli.export import extent
-from nerfcli.export.depth_views import DepthView, normals_of, plane_rays, point_colours, surface_colours
+from nerfcli.export.depth_views import (
+    DepthView,
+    depth_views,
+    normals_of,
+    plane_rays,
+    point_colours,
+    surface_colours,
+)
 from nerfcli.export.extent import Grid, SurfaceSettings, scene_box
 from nerfcli.export.fusion import FusedVolume, agreed_points, fuse
 from nerfcli.export.mesh_facts import read_glb_json
@@ -87,6 +95,18 @@ def test_the_box_leaves_out_what_is_far_behind(looks_out, monkeypatch):
     low, high = np.array(scene_box(model, ())).reshape(2, 3)
     np.testing.assert_allclose(low, CENTRE - [RADIUS, RADIUS, RADIUS], atol=0.15)
     assert (high < CENTRE + RADIUS + 0.15).all()
+
+
+def test_a_panorama_shows_the_surfaces_all_around():
+    """Regression: only those within 100 degrees ahead of it were in meshes, points and boxes."""
+    shell = foggy_cells((-0.8, -0.8, -0.8), (0.8, 0.8, 0.8)) & ~foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+    model, pose = replace(block(), occupied=shell), np.eye(4)
+    pose[:3, 3] = SIMILARITY.inverse().apply(np.array([0.1, -0.2, 0.0]))
+    views = depth_views(model, [Frame("a.jpg", equirectangular(128, 64), pose)], max_size=24)
+    assert all(np.isfinite(view.depth).all() and max(view.frame.camera.size) == 24 for view in views)
+    points = model.training_from_scene.apply(np.concatenate([view.points().reshape(-1, 3) for view in views]))
+    np.testing.assert_allclose(np.abs(points).max(axis=1), 0.5, atol=0.02)  # on the walls, all six of them
+    np.testing.assert_allclose([points.min(axis=0), points.max(axis=0)], [[-0.5] * 3, [0.5] * 3], atol=0.02)
 
 
 def test_normals_of_a_plane_are_its_own():

@@ -8,6 +8,7 @@ import torch
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import from_parts, rotation_from_vector
 from nerfcli.photos.loading import pinhole_of
 from nerfcli.render.coverage import DepthMap, normals_of_points
 from nerfcli.render.depth import DepthRequest
@@ -15,6 +16,10 @@ from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
 from nerfcli.render.tracing import render_rays
 
+# Rotations panorama_from_face of the faces of a cube: front, right, back, left, up, down.
+_TURNS = rotation_from_vector(
+    np.pi / 2 * np.array([[0.0, 0, 0], [0, 1, 0], [0, 2, 0], [0, -1, 0], [-1, 0, 0], [1, 0, 0]])
+)
 # The median depth: a little light that ends before or behind a surface does not change it.
 DEPTH = DepthRequest("median", "z")
 
@@ -62,7 +67,7 @@ def depth_views(
     depth: DepthRequest = DEPTH,
     on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[DepthView]:
-    """Render the views of frames with pinhole cameras.
+    """Render the views of frames with pinhole cameras; of a panorama, the six faces of a cube.
 
     Args:
         frames: frames of the photos, with any lens.
@@ -70,23 +75,30 @@ def depth_views(
         depth: definition of the depth, along the optical axis.
     """
     views = []
-    for frame in frames:
-        small = replace(frame, camera=small_pinhole(frame.camera, max_size))
+    small_frames = [small for frame in frames for small in _small_pinholes(frame, max_size)]
+    for small in small_frames:
         seen = render_picture(model, small, background=model.background, depth=depth)
         assert seen.depth is not None
         assert seen.spread is not None
         assert seen.disagreement is not None
         normals = normals_of(seen.depth, small.camera)
         views.append(DepthView(small, seen.rgb, seen.opacity, seen.depth, seen.spread, seen.disagreement, normals))
-        on_progress(len(views) / len(frames))
+        on_progress(len(views) / len(small_frames))
     return views
 
 
-def small_pinhole(camera: Camera, max_size: int) -> Camera:
-    """Return the pinhole camera for a lens, with a longer side of at most `max_size` pixels."""
-    factor = max(1.0, max(camera.size) / max_size)
-    pinhole = pinhole_of(camera)
-    return pinhole.resized(max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
+def _small_pinholes(frame: Frame, max_size: int) -> list[Frame]:
+    """Return frames of pinhole cameras that see what a frame sees, their longer sides at most `max_size` pixels."""
+    camera, pose = frame.camera, frame.world_from_cam
+    if not camera.is_spherical:
+        factor = max(1.0, max(camera.size) / max_size)
+        pinhole = pinhole_of(camera)
+        small = pinhole.resized(max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
+        return [replace(frame, camera=small)]
+    side = max(1, min(camera.width // 4, max_size))
+    face = Camera.pinhole(side, side, side / 2)  # 90 degrees
+    poses = [from_parts(pose[:3, :3] @ turn, pose[:3, 3]) for turn in _TURNS]
+    return [replace(frame, camera=face, world_from_cam=turned) for turned in poses]
 
 
 def spread_frames(frames: Sequence[Frame], count: int) -> list[Frame]:

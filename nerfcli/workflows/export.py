@@ -103,7 +103,7 @@ def _export_page(run: Run, model: Model, path: Path, *, settings: SurfaceSetting
     packed = pack_model(model)
     cameras = run.cameras
     frames = [pinhole_frame(frame) for frame in (*cameras.train, *cameras.test)]
-    box = settings.box or scene_box(model, frames)
+    box = settings.box or scene_box(model, [*cameras.train, *cameras.test])
     proof = make_proof(model, frames)
     reporter.progress(0.1, "depths of the training photos")
     seen = photo_depths(run, model, reporter, begin=0.1, end=0.4)

@@ -102,7 +102,13 @@ class RunData:
         version, model = self.model()
         run, frames = Run(self._path), self._frames()
         photos = fetched_photos(run.cameras.exposures, run.cameras.train, run.cameras.test)
-        scene = scene_of(model, run=self._path, frames=frames, photos=photos, box=_box(model, frames))
+        scene = scene_of(
+            model,
+            run=self._path,
+            frames=frames,
+            photos=photos,
+            box=_box(model, [*run.cameras.train, *run.cameras.test]),
+        )
         return live_page_html(scene, version=version, refusal=self._refusal(), far=model.marching.far)
 
     def field(self) -> bytes:
