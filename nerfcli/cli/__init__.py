@@ -82,7 +82,7 @@ def main_options(version: bool = typer.Option(False, "--version", help="Show the
     X-ray scans instead of photos:
       nerfcli ct --help
     Many captures:
-      ls -d captures/*/ | nerfcli poses - | nerfcli train - --budget 2m | nerfcli render -
+      ls -d captures/*/ | nerfcli poses - -o scenes | nerfcli train - -o runs | nerfcli render -
 
     Exit codes: 0 done; 1 a bug; 2 wrong usage; 3 bad input; 4 too few photos registered; 5 numbers became
     non-finite; 6 out of memory; 7 a quality gate not met; 8 another process of torchrun
