@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures import evidence
 from nerfcli.captures.axes import Convention, for_picture, opencv_from_axes, poses_of, reinterpreted
 from nerfcli.captures.capture import Capture, Observations
-from nerfcli.captures.detect import Detection, detect
+from nerfcli.captures.detect import Detection, HypothesisScore, Question, detect
 from nerfcli.captures.evidence import LEAST_MOVE, MatchEvidence, match_neighbours
 from nerfcli.captures.formats.colmap import write_colmap_text
 from nerfcli.captures.formats.transforms import write_transforms
@@ -51,6 +52,31 @@ def misread(capture: Capture, meant: Convention, parsed_axes: str) -> Capture:
         params[2:4] = [value + shift for value in params[2:4]]
         frames.append(replace(frame, camera=Camera(camera.model, camera.width, camera.height, tuple(params))))
     return replace(wrong, frames=tuple(frames))
+
+
+def test_a_hypothesis_that_is_behind_the_cameras_has_no_number_in_json(monkeypatch, tmp_path):
+    """Regression: --json printed Infinity, which is no JSON, and the table "inf times better"."""
+    scores = [
+        HypothesisScore(Convention("rdf"), True, 0.4, 0.9),
+        HypothesisScore(Convention("rub"), False, np.inf, 0.0),
+    ]
+    question = Question("axes and direction", tuple(scores), "holds", np.inf, "")
+    found = Detection("3 points", (question,), Convention("rdf"), Convention("rdf"))
+    read = (SimpleNamespace(name="colmap"), found)
+    monkeypatch.setattr("nerfcli.workflows.convert.detect_convention", lambda *given, **more: read)
+    result = nerfcli("convert", tmp_path, "--detect", "--json")
+    record = json.loads(result.stdout, parse_constant=lambda name: pytest.fail(name))
+    assert record["questions"][0]["ratio"] is None
+    assert record["questions"][0]["hypotheses"][1] == {
+        "axes": "rub",
+        "inverted": False,
+        "pixel_centre": 0.5,
+        "intrinsics_scale": 1.0,
+        "as_format_says": False,
+        "median_px": None,
+        "inlier_share": 0.0,
+    }
+    assert "fits; the next puts most of the evidence behind" in nerfcli("convert", tmp_path, "--detect").stdout
 
 
 def verdicts(found: Detection) -> dict[str, str]:

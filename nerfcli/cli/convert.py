@@ -306,9 +306,11 @@ def _hypothesis(question: "Question", answer: "HypothesisScore") -> str:
 
 
 def _verdict(question: "Question") -> str:
-    if question.verdict == "holds":
-        return f"fits, {question.ratio:.3g} times better than the next"
-    return f"{question.verdict}: {question.reason}"
+    if question.verdict != "holds":
+        return f"{question.verdict}: {question.reason}"
+    if question.ratio == float("inf"):
+        return "fits; the next puts most of the evidence behind the cameras"
+    return f"fits, {question.ratio:.3g} times better than the next"
 
 
 def _pixel_centre(text: str | None, option: str) -> float | None:

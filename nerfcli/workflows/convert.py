@@ -1,5 +1,6 @@
 """Convert a capture, or detect its convention."""
 
+import math
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -164,16 +165,13 @@ def detection_record(found: detect.Detection, form: str) -> dict[str, Any]:
             {
                 "question": question.name,
                 "verdict": question.verdict,
-                "ratio": question.ratio,
+                "ratio": _finite(question.ratio),
                 "reason": question.reason,
                 "hypotheses": [
                     {
-                        "axes": answer.convention.axes,
-                        "inverted": answer.convention.inverted,
-                        "pixel_centre": answer.convention.pixel_centre,
-                        "intrinsics_scale": answer.convention.intrinsics_scale,
+                        **asdict(answer.convention),
                         "as_format_says": answer.as_format_says,
-                        "median_px": None if answer.median_px == float("inf") else answer.median_px,
+                        "median_px": _finite(answer.median_px),
                         "inlier_share": answer.inlier_fraction,
                     }
                     for answer in question.answers
@@ -182,6 +180,11 @@ def detection_record(found: detect.Detection, form: str) -> dict[str, Any]:
             for question in found.questions
         ],
     }
+
+
+def _finite(value: float) -> float | None:
+    """Return a number that JSON has; None where most of the evidence is behind the cameras."""
+    return value if math.isfinite(value) else None
 
 
 def contents(capture: Capture) -> str:
