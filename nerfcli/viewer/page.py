@@ -1,7 +1,6 @@
 """The page that renders a field: a self-contained HTML file, or a live page from nerfcli's own server."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from itertools import starmap
 from pathlib import Path
@@ -25,34 +24,26 @@ SCRIPTS = ("geometry.js", "field.js", "render.js", "schedule.js", "walk.js", "pa
 LIVE_SCRIPTS = ("remote.js", "live.js")
 
 
-@dataclass(frozen=True)
-class PageNumbers:
-    """The field and the proof as stored in the page.
+def numbers_of(packed: PackedField, proof: Proof, seen: np.ndarray) -> tuple[dict[str, Any], str]:
+    """Return a packed field with its proof and its `seen_cells`, as the page stores them.
 
-    Args:
-        description: plain values.
-        elements: HTML elements with the compressed arrays.
+    Returns:
+        Plain values, and HTML elements with the compressed arrays.
     """
-
-    description: dict[str, Any]
-    elements: str
-
-    @classmethod
-    def of(cls, packed: PackedField, proof: Proof, seen: np.ndarray) -> "PageNumbers":
-        """Encode a packed field with its proof and its `seen_cells`."""
-        description = {"field": packed.field, "march": packed.march, "proof": proof.description, "seen": len(seen)}
-        arrays = {**packed.arrays, "expected": proof.expected, "seen": seen}
-        return cls(description, "\n".join(starmap(page.array_element, arrays.items())))
+    description = {"field": packed.field, "march": packed.march, "proof": proof.description, "seen": len(seen)}
+    arrays = {**packed.arrays, "expected": proof.expected, "seen": seen}
+    return description, "\n".join(starmap(page.array_element, arrays.items()))
 
 
-def page_html(scene: dict[str, Any], numbers: PageNumbers) -> str:
+def page_html(scene: dict[str, Any], numbers: tuple[dict[str, Any], str]) -> str:
     """Return the text of a page that needs no server.
 
     Args:
         scene: see `scene_of`, with the photos of `pictures.page_photos`.
-        numbers: its field, and the proof that the page compares its rendering with.
+        numbers: its field, and the proof that the page compares its rendering with, see `numbers_of`.
     """
-    return _html(scene | numbers.description, numbers.elements)
+    description, elements = numbers
+    return _html(scene | description, elements)
 
 
 def live_page_html(scene: dict[str, Any], *, version: int, refusal: str | None, far: float) -> str:

@@ -22,7 +22,7 @@ from nerfcli.render.coverage import coverage_and_parallax
 from nerfcli.render.model import Model
 from nerfcli.training.runs.run import Run
 from nerfcli.viewer.packing import pack_model, seen_cells
-from nerfcli.viewer.page import PageNumbers, page_html, scene_of
+from nerfcli.viewer.page import numbers_of, page_html, scene_of
 from nerfcli.viewer.pictures import make_proof, page_photos
 from nerfcli.workflows.photo_depths import photo_depths
 from nerfcli.workflows.splats import SplatSettings, export_splats, provenance_of, y_up_from_scene
@@ -107,8 +107,8 @@ def _export_page(run: Run, model: Model, path: Path, *, settings: SurfaceSetting
     proof = make_proof(model, frames)
     reporter.progress(0.1, "depths of the training photos")
     seen = photo_depths(run, model, reporter, begin=0.1, end=0.4)
-    numbers = PageNumbers.of(packed, proof, seen_cells(model, seen))
-    text_bytes = len(numbers.elements)
+    numbers = numbers_of(packed, proof, seen_cells(model, seen))
+    text_bytes = len(numbers[1])
     photos = page_photos(
         run.cameras.exposures,
         cameras.train,
