@@ -320,13 +320,6 @@ def test_centre_of_rotation_is_found(shift: float) -> None:
     assert found.is_off == (shift != 0)
 
 
-def test_centre_of_a_parallel_half_turn_is_found() -> None:
-    geometry = Circle("parallel", tuple(np.arange(90) * np.pi / 90), 0.5, 0.5, 1, 48).geometry()
-    scan = scan_of(geometry)
-    misaligned = Scan(geometry.shifted(-2.0), "counts", scan.values, scan.open_beam, photons_per_value=20.0)
-    assert centre_of(highest_contrast_row(misaligned)).shift == pytest.approx(2.0, abs=0.15)
-
-
 def test_tilt_of_the_detector_is_found() -> None:
     geometry = cone(12, rows=20, columns=32, pixel=1.1)
     scan = scan_of(geometry, photons=2e5)

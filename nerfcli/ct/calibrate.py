@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from scipy.optimize import minimize_scalar
 
+from nerfcli.ct.centre import SIGNIFICANT
 from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.grid import VoxelGrid, grid_of_scan, layers_of_rays
 from nerfcli.ct.likelihood import Poisson, likelihood_of, with_noise
@@ -26,8 +27,6 @@ TRIAL_VIEWS = 120
 TILT_RANGE = np.deg2rad(2.0)
 # Largest number of trials that its estimate takes.
 MOST_TILTS = 16
-# A correction is taken if it improves the prediction of views that were not fitted by this many standard errors.
-SIGNIFICANT = 3.0
 # Weight, in photons of air, of the prior that a view's open beam is that of the scan: it drifts by about 1 %.
 PRIOR_PHOTONS = 1e4
 # The largest line integral of a ray beside the object.
