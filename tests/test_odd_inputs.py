@@ -357,6 +357,22 @@ def test_uneven_scale_and_mirrors_stay_refused(form, block, what, tmp_path):
         parsed(tmp_path)
 
 
+@pytest.mark.parametrize("form", ["metashape", "mvsnet", "pose-files", "transforms"])
+def test_matrices_that_are_stored_column_by_column_are_refused(form, tmp_path):
+    """Read row by row, they would put all cameras at the origin."""
+    put(form, tmp_path)
+    if form == "transforms":
+        content = json.loads((tmp_path / "transforms.json").read_text())
+        for frame in content["frames"]:
+            frame["transform_matrix"] = np.transpose(frame["transform_matrix"]).tolist()
+        (tmp_path / "transforms.json").write_text(json.dumps(content))
+    else:
+        put(form, tmp_path, np.swapaxes(POSES, 1, 2))
+    with pytest.raises(UserError, match=r"last row is .*, expected 0 0 0 1") as caught:
+        parsed(tmp_path)
+    assert "column by column" in caught.value.hint
+
+
 def test_numbers_as_text_and_names_of_models_in_any_case(tmp_path):
     photos(tmp_path, numbered("{}.png"))
     content = transforms_record(numbered("{}.png"), camera_model="opencv", k1=-0.05)

@@ -21,6 +21,7 @@ MOST_PARAMETER = 1e12
 _MAX_DEVIATION = 1e-2
 # Rotations that deviate by less are kept, bit for bit.
 _ROUNDING = 1e-13
+_LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 # A rotation scaled by less is no rotation but an entry that was never filled.
 _LEAST_SCALE = 1e-9
 
@@ -107,7 +108,8 @@ class FramePoses:
             matrix: reads the matrix; a `NotFiniteError` says that this frame has none.
 
         Raises:
-            UserError: the upper left block is mirrored, or neither a rotation nor an evenly scaled one.
+            UserError: the upper left block is mirrored, or neither a rotation nor an evenly scaled one, or the fourth row
+                is not 0, 0, 0, 1.
         """
         found = self._checked(name, where, matrix)
         return None if found is None else rigid_pose(found[0], where)
@@ -159,6 +161,12 @@ class FramePoses:
             scale = float(np.sqrt((found[:3, :3] ** 2).sum() / 3))
             if scale < _LEAST_SCALE:
                 raise NotFiniteError(f"{where}: its rotation is zero", "expected a pose")
+            if len(found) == 4 and not np.allclose(found[3], _LAST_ROW, rtol=0, atol=_MAX_DEVIATION):
+                last = " ".join(f"{value:g}" for value in found[3])
+                raise UserError(
+                    f"{where}: its last row is {last}, expected 0 0 0 1",
+                    "the position is in the last column; write matrices row by row, not column by column",
+                )
         except NotFiniteError as error:
             self._lost.append((name, error))
             return None
