@@ -181,6 +181,21 @@ def test_a_conversion_names_missing_photos_and_fails_without_any(write, tmp_path
     assert not (tmp_path / "out 2.json").exists()
 
 
+@pytest.mark.parametrize("write", [colmap, transforms])
+def test_a_conversion_refuses_cameras_of_another_shape_than_their_photos(write, tmp_path):
+    """As training does. Poses alone can be written; a photo that EXIF mirrors or that is damaged is left to others."""
+    photos(tmp_path / "images", numbered("{}.png"), size=SIZE[::-1])
+    write(tmp_path, numbered("images/{}.png"))
+    refused = nerfcli("convert", tmp_path, tmp_path / "out.json", "--to", "transforms", "--allow-loss")
+    assert refused.exit_code == BAD_INPUT
+    assert "images/0.png: a picture of 480x640 pixels does not match a camera of 640x480" in error_of(refused)[0]
+    assert nerfcli("convert", tmp_path, tmp_path / "out.txt", "--to", "tum", "--allow-loss").exit_code == 0
+    (tmp_path / "images/0.png").write_bytes(b"")
+    photos(tmp_path / "images", numbered("{}.png")[1:])
+    kept = nerfcli("convert", tmp_path, tmp_path / "out.json", "--to", "transforms", "--allow-loss")
+    assert kept.exit_code == 0, kept.stderr
+
+
 def test_a_folder_is_listed_once_for_all_names(tmp_path, monkeypatch):
     names = [f"{index}.png" for index in range(2000)]
     (tmp_path / "images").mkdir()

@@ -224,17 +224,24 @@ def upright(frame: Frame, measure: Measure) -> Frame:
 def other_sizes(capture: Capture) -> dict[tuple[Size, Size], int]:
     """Count the photos on disk whose intrinsics are for another size, as in `Capture.rescaled`.
 
-    At most 200 photos, spread over the capture, are measured; those that do not fit their camera are skipped.
+    At most 200 photos, spread over the capture, are measured; those that cannot be read or are mirrored are skipped.
+
+    Raises:
+        UserError: a photo has another shape than its camera.
     """
     chosen = np.unique(np.linspace(0, len(capture.frames) - 1, _MOST_MEASURED).round().astype(int))
     sizes = []
     for frame in (capture.frames[index] for index in chosen):
         if not frame.has_photo:
             continue
+        assert frame.image is not None
         try:
-            sizes.append(rescaling(frame.camera, upright(frame, measure_of(capture)).camera))
-        except UserError:  # --detect and the commands that use the photos say what is wrong with them
+            measured = measure_of(capture)(frame.image)
+            turn_to_upright(frame.camera, measured, path=frame.image)
+        except UserError:  # the commands that use the photos say what is wrong with them
             continue
+        fitted, _ = fit_to_picture(frame.camera, frame.world_from_cam, path=frame.image, measured=measured)
+        sizes.append(rescaling(frame.camera, fitted))
     return counted(sizes)
 
 

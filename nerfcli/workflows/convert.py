@@ -50,7 +50,7 @@ def convert_capture(
         reporter.warn(text)
     if "cameras" not in wanted.form.lacks and ("cameras" not in form.lacks or given.images is not None):
         _report_missing(capture, reporter)
-    for text in describe_rescaling(other_sizes(capture)):
+    for text in describe_rescaling({} if "cameras" in wanted.form.lacks else other_sizes(capture)):
         reporter.note(f"{text.removesuffix(': rescaled')}; written to {to} unchanged")
     if text := _describe_outside(capture):
         reporter.warn(text)

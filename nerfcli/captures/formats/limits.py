@@ -108,8 +108,8 @@ class FramePoses:
             matrix: reads the matrix; a `NotFiniteError` says that this frame has none.
 
         Raises:
-            UserError: the upper left block is mirrored, or neither a rotation nor an evenly scaled one, or the fourth row
-                is not 0, 0, 0, 1.
+            UserError: the upper left block is mirrored, or neither a rotation nor an evenly scaled one; or the fourth
+                row is not 0, 0, 0, 1.
         """
         found = self._checked(name, where, matrix)
         return None if found is None else rigid_pose(found[0], where)
