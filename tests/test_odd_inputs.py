@@ -89,6 +89,22 @@ def numbered(pattern: str) -> list[str]:
         ("input/view_{}.png", "view_{}.png", "other names: input/view_0.png for view_0.png"),
         ("images_4/view_{}.png", "view_{}.png", "other names: images_4/view_0.png for view_0.png"),
         ("rgb/ü {}.png", "input/u\u0308 {}.JPG", "other names: rgb/ü 0.png for input/u\u0308 0.JPG"),
+        (
+            "images/my view_{}.png",
+            "images/my%20view_{}.png",
+            "other names: images/my view_0.png for images/my%20view_0",
+        ),
+        (
+            "images/left/é_{}.png",
+            "file:///C:/a%20b/Left/%C3%A9_{}.png",
+            "other names: images/left/é_0.png for file:///C:",
+        ),
+        ("images/100%25_{}.png", "images/100%25_{}.png", None),
+        (
+            "images/view_{}.HEIC.jpg",
+            "images/view_{}.HEIC",
+            "other names: images/view_0.HEIC.jpg for images/view_0.HEIC",
+        ),
         ("view_{}.png", "view_{}.png", None),
     ],
 )
@@ -112,6 +128,12 @@ def find(folder: Path, names: Sequence[str], **more: Any) -> Any:
 def test_the_longest_common_end_wins_and_an_exact_name_comes_first(tmp_path):
     photos(tmp_path, ["images/a.png", "images/left/a.png", "images/A.PNG"])
     assert levels(find(tmp_path, ["D:\\x\\left\\a.png", "A.PNG", "a.png"]).paths) == [1, 2, 0]
+
+
+def test_a_name_with_a_percent_sign_is_first_taken_as_it_is(tmp_path):
+    photos(tmp_path, ["images/a%20b.png", "images/a b.png", "images/IMG_1.jpg", "images/IMG_1.HEIC.jpg"])
+    listed = ["a b.png", "a%20b.png", "C:\\x\\a%20b.png", "images/IMG_1.HEIC.jpg", "IMG_1.heic", " images/IMG_1.jpg "]
+    assert [levels(find(tmp_path, [name]).paths) for name in listed] == [[1], [0], [0], [3], [2], [2]]
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -52,7 +53,8 @@ class Name:
         is_absolute = pure.is_absolute() or _DRIVE.match(listed) is not None
         parts = [part for part in pure.parts[:-1] if part.strip("/") not in ("", "..") and not _DRIVE.fullmatch(part)]
         whole, stem = _plain(pure.name), _plain(_SUFFIX.sub("", pure.name))
-        stems = (stem,) if pure.suffix.lower() in IMAGE_SUFFIXES else (whole, stem)
+        # Converters also append a suffix: IMG_1.HEIC becomes IMG_1.HEIC.jpg.
+        stems = (stem, whole) if pure.suffix.lower() in IMAGE_SUFFIXES else (whole, stem)
         return cls(listed, str(pure), tuple(map(_plain, parts)), stems, is_absolute)
 
     @property
@@ -116,8 +118,11 @@ class Search:
 
 
 def _plain(text: str) -> str:
-    """Return a text without what file systems of other machines change: the case of letters, composed accents."""
-    return unicodedata.normalize("NFC", text).casefold()
+    """Return a text without what other machines and programs change.
+
+    These are the case of letters, composed accents, spaces at the ends, and the percent-encoding of addresses.
+    """
+    return unicodedata.normalize("NFC", unquote(text)).casefold().strip()
 
 
 def places_of(
@@ -274,5 +279,5 @@ def _other_shape(place: Place, path: Path, fit: _Fit, size: Size | None) -> User
 
 
 def plain_name(listed: str) -> str:
-    """Return a name with forward slashes and without "./"."""
-    return str(PurePosixPath(listed.replace("\\", "/")))
+    """Return a name with forward slashes and without "./", the scheme of an address, and spaces at its ends."""
+    return str(PurePosixPath(listed.strip().replace("\\", "/").removeprefix("file://")))
