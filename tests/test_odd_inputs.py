@@ -470,6 +470,27 @@ def test_lines_of_features_that_were_left_out_by_hand(between, tmp_path):
     assert len(capture.points) == len(CAPTURE.points)
 
 
+def test_whole_numbers_with_decimals_tabs_and_indented_comments(tmp_path):
+    photos(tmp_path / "images", numbered("{}.png"))
+    colmap(tmp_path, numbered("{}.png"))
+    cameras, images, points = (tmp_path / f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D"))
+    (line,) = (line for line in cameras.read_text().splitlines() if not line.startswith("#"))
+    camera_id, model, width, height, *params = line.split()
+    cameras.write_text("\t# by hand\n" + "\t".join([f"{camera_id}.0", model, f"{width}.00", f"{height}e0", *params]))
+    rows = [line.split("\t") for line in images.read_text().replace(" ", "\t").splitlines() if line[0] != "#"]
+    for row in rows[::2]:
+        row[0], row[8] = f"{row[0]}.000e+00", f"{row[8]}.0"
+    images.write_text("  # by hand\n" + "\n".join(map("\t".join, rows)))
+    points.write_text(" # by hand\n" + points.read_text())
+    capture = parsed(tmp_path)
+    np.testing.assert_allclose([f.centre for f in capture.frames], [f.centre for f in CAPTURE.frames], atol=1e-12)
+    assert {frame.camera for frame in capture.frames} == {PINHOLE}
+    assert len(capture.points) == len(CAPTURE.points)
+    cameras.write_text(f"1 PINHOLE 640.5 480 {' '.join(params)}\n")
+    with pytest.raises(UserError, match=r"cameras\.txt is damaged: 640\.5 is not a whole number"):
+        parsed(tmp_path)
+
+
 def test_names_in_a_code_page_of_windows_are_refused_with_what_to_do(tmp_path):
     put("colmap", tmp_path)
     path = tmp_path / "sparse/0/images.bin"

@@ -238,7 +238,8 @@ def num_images(model_dir: Path) -> int:
     if path.suffix == ".txt":
         with opened(path) as stream:
             # The line after an image's line lists its features.
-            return sum(1 for line in stream if line.strip() and line[0] != "#" and (next(stream, "") or True))
+            lines = (line for line in stream if line.strip() and not line.lstrip().startswith("#"))
+            return sum(1 for _ in lines if next(stream, "") or True)
     with path.open("rb") as stream:
         head = stream.read(8)
     return int.from_bytes(head, "little") if len(head) == 8 else 0

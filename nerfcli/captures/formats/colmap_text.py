@@ -1,8 +1,9 @@
 """The text files of a COLMAP model: cameras.txt, images.txt and points3D.txt.
 
-Lines that begin with # are comments. A name in images.txt is the rest of its line, spaces included; COLMAP itself
-writes such names and cuts them at the first space when it reads them (4.2.1). Source: colmap.github.io/format.html;
-colmap src/colmap/scene/reconstruction_io_text.cc.
+Lines that begin with #, perhaps after spaces, are comments. Whole numbers may have decimals, as NumPy writes them. A
+name in images.txt is the rest of its line, spaces included; COLMAP itself writes such names and cuts them at the first
+space when it reads them (4.2.1). Source: colmap.github.io/format.html; colmap
+src/colmap/scene/reconstruction_io_text.cc.
 """
 
 import numpy as np
@@ -22,10 +23,11 @@ def cameras_from_bytes(data: bytes) -> dict[int, Camera]:
     for line in _filled(_lines(data)):
         camera_id, model, width, height, *params = line.split()
         where = f"camera {camera_id}"
-        if int(camera_id) in cameras:
+        key = _whole(camera_id)
+        if key in cameras:
             raise ValueError(f"two cameras have the id {camera_id}")
         values = tuple(float(value) for value in params)
-        cameras[int(camera_id)] = checked_camera(model.upper(), int(width), int(height), values, where=where)
+        cameras[key] = checked_camera(model.upper(), _whole(width), _whole(height), values, where=where)
     return cameras
 
 
@@ -34,7 +36,7 @@ def images_from_bytes(data: bytes) -> tuple[list[ColmapImage], tuple[str, ...]]:
     rows, lines = list[ImageRow](), _lines(data)[::-1]
     while lines:
         line = lines.pop()
-        if not line.strip() or line.startswith("#"):
+        if not _is_filled(line):
             continue
         image_id, *pose, camera_id, name = line.strip().split(maxsplit=9)
         # The line after an image's line lists its features; it may be empty, and is missing in files written by hand.
@@ -46,7 +48,7 @@ def images_from_bytes(data: bytes) -> tuple[list[ColmapImage], tuple[str, ...]]:
             raise ValueError(f"the features of image {name} are {len(values)} numbers, expected x, y, point id of each")
         values = values.reshape(-1, 3)
         point_ids = _ids(values[:, 2], f"a point of image {name}")
-        rows.append((int(image_id), name, int(camera_id), list(map(float, pose)), values[:, :2], point_ids))
+        rows.append((_whole(image_id), name, _whole(camera_id), list(map(float, pose)), values[:, :2], point_ids))
     return images_of_rows(rows)
 
 
@@ -127,7 +129,18 @@ def _is_image(line: str) -> bool:
 
 
 def _filled(lines: list[str]) -> list[str]:
-    return [line for line in lines if line.strip() and not line.startswith("#")]
+    return list(filter(_is_filled, lines))
+
+
+def _is_filled(line: str) -> bool:
+    return not line.lstrip().startswith("#") and bool(line.strip())
+
+
+def _whole(word: str) -> int:
+    value = float(word)
+    if not value.is_integer():  # neither are NaN and infinity
+        raise ValueError(f"{word} is not a whole number")
+    return int(value)
 
 
 def _ids(values: np.ndarray, what: str) -> np.ndarray:
