@@ -217,12 +217,16 @@ def vector(record: dict[str, Any], key: str, count: int, where: str) -> np.ndarr
 
 
 def matrix(record: dict[str, Any], key: str, rows: tuple[int, ...], columns: int, where: str) -> np.ndarray:
-    """Return a matrix of a JSON object, as float64: a list of rows, whose number is one of `rows`.
+    """Return a matrix of a JSON object, as float64: a list of rows, whose number is one of `rows`, or of all numbers.
 
     Raises:
-        UserError: the key is absent, or its value is not such a list; a `NotFiniteError` if a number is not known.
+        UserError: the value is not such a list; a `NotFiniteError` if it is absent or empty, or a number is not known.
     """
     value = record.get(key)
+    if value is None or value == []:
+        raise NotFiniteError(f"{where}: {key} is missing", f"expected {rows[-1]} rows of {columns} numbers")
+    if isinstance(value, list) and len(value) in [count * columns for count in rows]:
+        value = [value[start : start + columns] for start in range(0, len(value), columns)]
     if isinstance(value, list) and len(value) in rows and all(len(r) == columns for r in value if isinstance(r, list)):
         return np.stack([vector({key: row}, key, columns, where) for row in value])
     raise _no_value(record, key, where, f"expected {rows[-1]} rows of {columns} numbers")
