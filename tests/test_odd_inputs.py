@@ -422,6 +422,81 @@ def test_numbers_as_text_and_names_of_models_in_any_case(tmp_path):
         parsed(tmp_path)
 
 
+def written(folder: Path, **more: Any) -> dict[str, Any]:
+    """Write photos; return a transforms.json of them, with further keys."""
+    photos(folder, numbered("{}.png"))
+    return transforms_record(numbered("{}.png"), **more)
+
+
+def read_again(folder: Path, content: dict[str, Any]) -> Capture:
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return parsed(folder)
+
+
+def test_a_matrix_as_one_list_of_numbers_and_frames_without_one(tmp_path):
+    content = written(tmp_path)
+    for frame in content["frames"]:
+        frame["transform_matrix"] = np.ravel(frame["transform_matrix"]).tolist()
+    content["frames"][0]["transform_matrix"] = []
+    del content["frames"][2]["transform_matrix"]
+    capture = read_again(tmp_path, content)
+    kept = [0 < index != 2 for index in range(COUNT)]
+    expected = [frame.centre for frame, keep in zip(CAPTURE.frames, kept, strict=True) if keep]
+    np.testing.assert_allclose([frame.centre for frame in capture.frames], expected, atol=1e-12)
+    assert len(capture.notes) == 1
+    assert capture.notes[0].startswith(f"2 of {COUNT} frames left out: 0.png, 2.png (")
+
+
+def test_a_frame_has_its_own_focal_length_in_either_key(tmp_path):
+    content = written(tmp_path, fl_x=300.0, fl_y=300.0)
+    for frame in content["frames"]:
+        frame |= {f"camera_angle_{axis}": 2 * np.arctan(SIZE[side] / 2 / 140) for side, axis in enumerate("xy")}
+    capture = read_again(tmp_path, content)
+    np.testing.assert_allclose([frame.camera.focal_lengths for frame in capture.frames], 140.0, rtol=1e-12)
+    assert capture.notes == ()
+
+
+def test_two_keys_that_give_different_focal_lengths_are_said(tmp_path):
+    """nerfstudio and instant-ngp read fl_x; programs write both for the same length, up to rounding."""
+    fx = PINHOLE.params[0]
+    same = written(tmp_path, camera_angle_x=2 * np.arctan(SIZE[0] / 2 / fx) * 1.001, camera_angle_y=59.0)
+    assert read_again(tmp_path, same).notes == ()
+    capture = read_again(tmp_path, same | {"camera_angle_x": 2 * np.arctan(SIZE[0] / 2 / 200)})
+    assert {frame.camera for frame in capture.frames} == {PINHOLE}
+    what = f"camera_angle_x of {COUNT} frames is that of another focal length, 200 pixels, than fl_x, {fx:.4g}"
+    assert capture.notes == (f"{what}: fl_x is used",)
+    same["frames"][1] |= {"transform_matrix": np.full((4, 4), np.nan).tolist(), "fl_x": np.nan, "camera_angle_y": None}
+    assert len(read_again(tmp_path, same).frames) == COUNT - 1
+
+
+def test_empty_texts_of_a_template_are_no_numbers_and_no_masks(tmp_path):
+    content = written(tmp_path, k1="", k2="", camera_angle_x="", camera_model=" pinhole ", mask_path=" ")
+    capture = read_again(tmp_path, content)
+    assert {frame.camera for frame in capture.frames} == {PINHOLE}
+    assert capture.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("more", "what"),
+    [
+        ({"fl_x": 0.78, "fl_y": 1.04, "cx": 0.5, "cy": 0.5}, "fl_x is 0.78"),
+        ({"camera_model": "OPENCV", "k5": 0.1}, "k5 is 0.1 and k6 is 0"),
+    ],
+)
+def test_intrinsics_without_a_meaning_are_refused(more, what, tmp_path):
+    """Fractions of the picture instead of pixels; terms that the model does not have, and that were ignored."""
+    with pytest.raises(UserError, match=what):
+        read_again(tmp_path, written(tmp_path, **more))
+
+
+def test_full_opencv_is_the_model_of_colmap_with_a_divisor(tmp_path):
+    terms = {"k1": 0.1, "k2": 0.02, "p1": 0.001, "p2": 0.002, "k3": 0.003, "k4": 0.11, "k5": 0.01, "k6": 0.001}
+    capture = read_again(tmp_path, written(tmp_path, camera_model="FULL_OPENCV", **terms))
+    assert {frame.camera for frame in capture.frames} == {
+        Camera("FULL_OPENCV", *SIZE, (*PINHOLE.params, *terms.values()))
+    }
+
+
 # Models
 
 

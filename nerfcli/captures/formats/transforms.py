@@ -30,8 +30,10 @@ from nerfcli.captures.formats.record3d import find_record3d
 from nerfcli.captures.formats.run_cameras import find_run
 from nerfcli.captures.formats.transforms_cameras import (
     camera_of_record,
+    contradictions,
     given_size,
     lost_to_transforms,
+    merged,
     record_of_camera,
 )
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts
@@ -113,7 +115,7 @@ def records_of(path: Path, content: dict[str, Any], key: str = "frames") -> list
         raise malformed(
             str(path), f"has no list of {key}", f'expected "{key}": [{{"file_path", "transform_matrix"}}, ...]'
         )
-    return [({**content, **record}, f"{path}: {key}[{index}]") for index, record in enumerate(records)]
+    return [(merged(content, record), f"{path}: {key}[{index}]") for index, record in enumerate(records)]
 
 
 def listed_frames(
@@ -159,7 +161,7 @@ def listed_frames(
     splits = _listed_splits(path, content)
     cameras: dict[Camera, Camera] = {}
     fits, poses = Fits(), FramePoses()
-    frames, missing = [], []
+    frames, missing, used = [], [], []
     for index, ((record, where), own_size) in enumerate(zip(listed, known, strict=True)):
         read = partial(matrix, record, "transform_matrix", (3, 4), 4, where)
         world_from_cam = poses.read(names[index], f"{where}.transform_matrix", read)
@@ -172,18 +174,20 @@ def listed_frames(
         split, depth = splits.get(plain_name(texts[index])), _listed_depth(home, record, where)
         camera = cameras.setdefault(camera, camera)
         frames.append(Frame(names[index], camera, pose, places[index], masks[index], split=split, depth=depth))
-    return frames, missing, (*found.notes, *poses.notes(), *fits.notes(), *lost_masks)
+        used.append((record, where, own_size))
+    notes = (*found.notes, *poses.notes(), *contradictions(used), *fits.notes(), *lost_masks)
+    return frames, missing, notes
 
 
 def _masks(
     path: Path, listed: Sequence[tuple[dict[str, Any], str]], home: Path, folder: str, *, photos: set[Path]
 ) -> tuple[list[Path | None], tuple[str, ...]]:
     """Return the mask of each frame, None without one or where it is not on disk, and what was left out."""
-    texts = [record.get("mask_path") for record, _ in listed]
+    texts = [record.get("mask_path") or "" for record, _ in listed]
     for mask, (_, where) in zip(texts, listed, strict=True):
-        if mask is not None and not isinstance(mask, str):
+        if not isinstance(mask, str):
             raise malformed(where, f"mask_path is {mask!r:.80}", "expected the mask's path as text")
-    named = {mask for mask in texts if mask}
+    named = {mask for mask in texts if mask.strip()}
     found = find_photos(sorted(named), (home,), folders=(folder,), others=())
     paths = {name: image for name, image in zip(found.listed, found.paths, strict=True) if image not in photos}
     lost = sorted(name for name in named if paths.get(name) is None)

@@ -4,19 +4,30 @@ Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Size
 from nerfcli.captures.formats import fields, lenses
 from nerfcli.captures.formats.fields import malformed
 from nerfcli.captures.formats.lenses import Fits, Terms
 from nerfcli.captures.formats.limits import checked_camera
 from nerfcli.captures.formats.unsupported import distortion, projection
+from nerfcli.errors import several
 
-_INTRINSICS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_INTRINSICS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+# Keys that give the same number; the first counts.
+_SAME = (("fl_x", "camera_angle_x"), ("fl_y", "camera_angle_y"))
+# A smaller focal length, as a fraction of the picture's side, is no length in pixels: the view would be 178 degrees.
+_LEAST_FOCAL = 0.01
+# Rounding, and resizing to whole pixels, explain that two keys give focal lengths which differ by this fraction.
+_SAME_FOCAL = 0.01
 
 _PERSPECTIVE_MODELS = (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 _FISHEYE_MODELS = ("OPENCV_FISHEYE", "FISHEYE")
+# OpenCV's with a divisor of k4, k5 and k6, as in COLMAP; with other models k4 is the polynomial's term of r^8.
+_RATIONAL = "FULL_OPENCV"
 
 # Lens models of instant-ngp that COLMAP does not have.
 _FOREIGN = ("ftheta_p0", "latlong")
@@ -48,7 +59,7 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
     """
     width, height = size
     model = record.get("camera_model")
-    model = model.upper() if isinstance(model, str) else model
+    model = model.strip().upper() if isinstance(model, str) else model
     if model == "EQUIRECTANGULAR":
         return lenses.spherical_camera(size, where)
     foreign = next((key for key in _FOREIGN if record.get(key) not in (None, False)), None)
@@ -65,13 +76,17 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
     assert fy is not None
     cx, cy = number(record, "cx", where), number(record, "cy", where)
     head = (fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-    k1, k2, k3, k4, p1, p2 = (number(record, key, where) or 0.0 for key in _INTRINSICS)
+    k1, k2, k3, k4, k5, k6, p1, p2 = (number(record, key, where) or 0.0 for key in _INTRINSICS)
     if model in _FISHEYE_MODELS or record.get("is_fisheye") is True:
         radial, tangential = (k1, k2, k3, k4), (p1, p2)
         return lenses.fisheye_camera(size, head[:2], head[2:], radial=radial, tangential=tangential, where=where)
     if model not in _PERSPECTIVE_MODELS:
         supported = ", ".join(str(name) for name in (*_PERSPECTIVE_MODELS[1:], *_FISHEYE_MODELS, "EQUIRECTANGULAR"))
         raise malformed(where, f"camera_model {model!r:.80} is not supported", f"expected one of {supported}")
+    if model == _RATIONAL:
+        return checked_camera(model, width, height, (*head, k1, k2, p1, p2, k3, k4, k5, k6), where=where)
+    if k5 or k6:
+        raise malformed(where, f"k5 is {k5:g} and k6 is {k6:g}", f"only camera_model {_RATIONAL} has these terms")
     if k4:
         return fits.brown(size, head[:2], head[2:], terms=Terms((k1, k2, k3, k4), (p1, p2)), where=where)
     if k3:
@@ -80,6 +95,33 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
     if k1 or k2 or p1 or p2:
         return checked_camera("OPENCV", width, height, (*head, k1, k2, p1, p2), where=where)
     return checked_camera("PINHOLE", width, height, head, where=where)
+
+
+def merged(content: dict[str, Any], record: dict[str, Any]) -> dict[str, Any]:
+    """Return the keys of a frame over those of the whole file, whose focal lengths count only where it has none."""
+    own = {key for keys in _SAME if any(record.get(key) not in (None, "") for key in keys) for key in keys}
+    return {key: value for key, value in content.items() if key not in own} | record
+
+
+def contradictions(listed: Sequence[tuple[dict[str, Any], str, Size]]) -> tuple[str, ...]:
+    """Return a line for each axis on which two keys give different focal lengths, for people.
+
+    Args:
+        listed: the frames' keys, see `merged`, their places in the file, and the sizes of their pictures.
+    """
+    notes = []
+    for side, (key, other) in enumerate(_SAME):
+        off = []
+        for record, where, size in listed:
+            focal, angle = number(record, key, where), number(record, other, where)
+            if focal is not None and angle is not None and 0 < angle < math.pi:
+                by_angle = size[side] / 2 / math.tan(angle / 2)
+                off += [(by_angle, focal)] if abs(by_angle - focal) > _SAME_FOCAL * focal else []
+        if off:
+            by_angle, focal = off[0]
+            what = f"{other} of {several(len(off), 'frame')} is that of another focal length, {by_angle:.4g} pixels"
+            notes.append(f"{what}, than {key}, {focal:.4g}: {key} is used")
+    return tuple(notes)
 
 
 def record_of_camera(camera: Camera) -> dict[str, Any]:
@@ -117,19 +159,20 @@ def given_size(record: dict[str, Any], where: str) -> tuple[int, int] | None:
 
 
 def number(record: dict[str, Any], key: str, where: str) -> float | None:
-    """Return the number under a key, or None if there is none.
+    """Return the number under a key, or None if there is none: no key, null, or the empty text of a template.
 
     Raises:
         UserError: the value is not a finite number.
     """
-    return None if record.get(key) is None else fields.number(record, key, where)
+    return None if record.get(key) in (None, "") else fields.number(record, key, where)
 
 
 def _focal(record: dict[str, Any], axis: str, size_px: int, where: str) -> float | None:
     focal = number(record, f"fl_{axis}", where)
     if focal is not None:
-        if focal <= 0:
-            raise malformed(where, f"fl_{axis} is {focal}", "expected a focal length in pixels above 0")
+        if focal < _LEAST_FOCAL * size_px:
+            hint = f"expected a focal length in pixels, of pictures with {size_px} pixels there"
+            raise malformed(where, f"fl_{axis} is {focal}", hint)
         return focal
     angle = number(record, f"camera_angle_{axis}", where)
     if angle is None:
