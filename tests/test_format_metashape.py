@@ -147,6 +147,8 @@ def test_cameras_by_hand(tmp_path):
     capture = parse_metashape(write(tmp_path, document(sensor_xml({"f": 500.0}), "".join(cameras))))
     assert [(frame.name, frame.image) for frame in capture.frames] == [("DCIM/b c.jpg", None), ("ü", None)]
     assert (capture.kind, capture.unit, capture.missing) == ("metashape", "arbitrary", ())
+    left_out = (("not aligned", "not aligned"), ("disabled in Metashape", "disabled"))
+    assert capture.notes == tuple(f"1 of 4 cameras left out, {reason}: {name}" for reason, name in left_out)
     np.testing.assert_allclose(capture.frames[0].world_from_cam, CHUNK_FROM_CAM, rtol=0, atol=1e-15)
 
 
@@ -179,9 +181,25 @@ def test_of_components_without_a_common_world_the_largest_is_read(tmp_path):
     alone = '<component id="0"/><component id="1"/>'
     capture = parse_metashape(write(tmp_path, document(sensor_xml({"f": 500.0}), cameras, components=alone)))
     assert [frame.name for frame in capture.frames] == ["1 0", "1 1"]
+    others = "others, which are in other coordinates:"
+    assert capture.notes == (f"component '1' with 2 cameras is read; {others} '0' with 1",)
     common = f'<component id="0">{WORLD}</component><component id="1">{WORLD}</component>'
     capture = parse_metashape(write(tmp_path, document(sensor_xml({"f": 500.0}), cameras, components=common)))
     assert [frame.name for frame in capture.frames] == ["0 0", "1 0", "1 1"]
+    assert capture.notes == ()
+
+
+def test_of_several_chunks_that_with_most_aligned_cameras_is_read(tmp_path):
+    first, second, third = (
+        document(sensor_xml({"f": 500.0}), "".join(camera_xml(f"{key} {i}") for i in range(count)))
+        for key, count in (("a", 1), ("b", 3), ("c", 2))
+    )
+    unaligned = second.replace("<cameras>", "<cameras>" + camera_xml("x", pose=None))
+    between = [text[text.index("<chunk") : text.index("</document>")] for text in (unaligned, third)]
+    capture = parse_metashape(write(tmp_path, first.replace("</document>", "".join(between) + "</document>")))
+    assert [frame.name for frame in capture.frames] == ["b 0", "b 1", "b 2"]
+    others = "others, which are in other coordinates: 1 (Chunk 1) with 1, 3 (Chunk 1) with 2"
+    assert capture.notes[0] == f"chunk 2 (Chunk 1) with 3 cameras is read; {others}"
 
 
 def test_each_camera_has_its_sensor(tmp_path):

@@ -51,11 +51,12 @@ _SPHERICAL = "spherical"
 
 
 def parse_metashape(path: Path) -> Capture:
-    """Read the aligned cameras of the file's first chunk.
+    """Read the aligned cameras of the file's chunk, the one with most of them if there are several.
 
     Cameras without a label or a transform (not aligned, or a follower in a camera rig), of a sensor that is not
     calibrated, and disabled ones give no frames. If a component lacks a transform to the world, components are
-    unrelated to each other, and only the one with the most cameras is read. The file does not say where the photos are;
+    unrelated to each other, and only the one with the most cameras is read. What is left out is noted.
+    The file does not say where the photos are;
     a frame's name is the camera's label, and where labels are equal, that of its group before it. The unit stays
     arbitrary: a component's transform comes from georeferencing (then it is in metres) or from moving the model by
     hand, and the file does not say which.
@@ -64,21 +65,23 @@ def parse_metashape(path: Path) -> Capture:
         UserError: the file is damaged (file and field are named), has a lens that no COLMAP model holds, or equal
             labels.
     """
-    chunk = _chunk(path)
+    chunk, notes = _chunk(path)
     groups = {camera: group.get("label", "") for group in chunk.iterfind("cameras/group") for camera in group}
-    listed = [one for one in chunk.iterfind("cameras//camera") if one.get("enabled", "true") not in ("false", "0")]
+    listed = list(chunk.iterfind("cameras//camera"))
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
     reasons = {camera: _unusable(camera, sensors) for camera in listed}
     records = [camera for camera in listed if not reasons[camera]]
     if listed and not records:
         first = f"{shown(listed[0].get('label'))} is {reasons[listed[0]]}"
         raise malformed(str(path), f"lists no images with a pose: {first}", "align the photos, and export again")
-    notes = [_left_out(reason, reasons) for reason in dict.fromkeys(reasons.values()) if reason]
+    notes += [_left_out(reason, reasons) for reason in dict.fromkeys(reasons.values()) if reason]
     worlds = _worlds_from_chunk(chunk, path)
     components = [record.get("component_id") for record in records]
     if None in (worlds.get(component) for component in components):
-        kept = max(dict.fromkeys(components), key=components.count)
+        counts = Counter(components)
+        kept = max(counts, key=lambda component: counts[component])
         records = [record for record in records if record.get("component_id") == kept]
+        notes += _one_of("component", {shown(component): count for component, count in counts.items()}, shown(kept))
     labels = Counter(record.get("label") for record in records)
     cameras: dict[str | None, Camera] = {}
     fits, poses, frames = Fits(), FramePoses(), []
@@ -106,6 +109,8 @@ def parse_metashape(path: Path) -> Capture:
 
 def _unusable(camera: Element, sensors: Mapping[str | None, Element]) -> str:
     """Return why a camera gives no frame; empty if it gives one."""
+    if not _is_enabled(camera):
+        return "disabled in Metashape"
     if not (camera.get("label") or "").strip():
         return "without a label"
     if camera.find("transform") is None:
@@ -120,13 +125,30 @@ def _left_out(reason: str, reasons: Mapping[Element, str]) -> str:
     return f"{len(names)} of {several(len(reasons), 'camera')} left out, {reason}: {in_words(names)}"
 
 
-def _chunk(path: Path) -> Element:
-    """Return the first chunk: the root's child in an exported file, the root itself in the file of a project."""
+def _is_enabled(record: Element) -> bool:
+    return record.get("enabled", "true") not in ("false", "0")
+
+
+def _one_of(kind: str, counts: Mapping[str, int], kept: str) -> list[str]:
+    """Return a note on the parts of a file in other coordinates, none if there are none; `counts` of their cameras."""
+    others = ", ".join(f"{name} with {count}" for name, count in counts.items() if name != kept)
+    what = f"{kind} {kept} with {several(counts[kept], 'camera')} is read"
+    return [f"{what}; others, which are in other coordinates: {others}"] if others else []
+
+
+def _chunk(path: Path) -> tuple[Element, list[str]]:
+    """Return the chunk with most aligned cameras, and a note on the others.
+
+    A chunk is the root's child in an exported file, the root itself in the file of a project.
+    """
     root = read_xml(path, _EXPECTED)
-    chunk = root if root.tag == "chunk" else root.find("chunk")
-    if chunk is None:
+    chunks = [root] if root.tag == "chunk" else root.findall("chunk")
+    if not chunks:
         raise malformed(str(path), f"has no chunk element, but a {shown(root.tag)}", _EXPECTED)
-    return chunk
+    names = [f"{number} ({chunk.get('label', '')})" for number, chunk in enumerate(chunks, start=1)]
+    aligned = [len(chunk.findall("cameras//camera/transform")) for chunk in chunks]
+    best = aligned.index(max(aligned))
+    return chunks[best], _one_of("chunk", dict(zip(names, aligned, strict=True)), names[best])
 
 
 def _worlds_from_chunk(chunk: Element, path: Path) -> dict[str | None, rigid.Similarity | None]:
