@@ -68,6 +68,7 @@ def test_poses_are_world_from_camera_by_rows_and_names_are_relative(tmp_path):
     (tmp_path / "day 2/a.jpg").write_bytes(b"")
     capture = parse_alicevision(write(tmp_path, content()))
     # The third view has no pose.
+    assert capture.notes[1:] == ("1 photo without a pose left out: day 2/lost.jpg",)
     assert [frame.name for frame in capture.frames] == ["day 1/a.jpg", "day 2/a.jpg"]
     assert [frame.image for frame in capture.frames] == [tmp_path / "day 1/a.jpg", tmp_path / "day 2/a.jpg"]
     poses = [frame.world_from_cam for frame in capture.frames]
@@ -109,6 +110,26 @@ def test_focal_length_and_principal_point_of_each_version(tmp_path, version, len
     camera = parse_alicevision(write(tmp_path, file)).frames[0].camera
     assert (camera.model, camera.width, camera.height) == ("PINHOLE", 640, 480)
     np.testing.assert_allclose(camera.params, params, rtol=1e-15)
+
+
+def test_numbers_that_are_no_texts(tmp_path):
+    """As scripts in Python write them that read the file with float()."""
+
+    def as_numbers(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: item if key.endswith("Id") else as_numbers(item) for key, item in value.items()}
+        if isinstance(value, list):
+            return list(map(as_numbers, value))
+        try:
+            return float(value)
+        except ValueError:
+            return value
+
+    as_texts = parse_alicevision(write(tmp_path, content()))
+    again = parse_alicevision(write(tmp_path, as_numbers(content())))
+    assert [frame.camera for frame in again.frames] == [frame.camera for frame in as_texts.frames]
+    for frame, other in zip(again.frames, as_texts.frames, strict=True):
+        np.testing.assert_array_equal(frame.world_from_cam, other.world_from_cam)
 
 
 def distorted(x: np.ndarray, y: np.ndarray, terms: list[float]) -> tuple[np.ndarray, np.ndarray]:

@@ -119,6 +119,7 @@ def test_unregistered_and_missing_photos_are_no_frames(tmp_path):
     capture = parse(write(tmp_path, "\n".join(unseen), on_disk=["ü.jpg"]))
     assert [frame.name for frame in capture.frames] == ["ü.jpg"]
     assert capture.missing == ("b c.jpg",)
+    assert capture.notes[-1] == "1 photo without a pose left out: a.jpg"
     assert capture.observations is not None
     np.testing.assert_array_equal(capture.observations.frame_index, np.zeros(6))
     np.testing.assert_array_equal(capture.observations.point_index, np.arange(1, 7))

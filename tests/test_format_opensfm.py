@@ -97,6 +97,8 @@ def test_shots_points_and_names_by_hand(tmp_path):
     path = write_file(tmp_path / "reconstruction.json", reconstruction(), one)
     capture = parse_opensfm(path)
     assert [frame.name for frame in capture.frames] == ["b c.jpg", "ü.jpg"]  # of the larger of the two reconstructions
+    others = "others, which are in other coordinates: 0 with 1"
+    assert capture.notes == (f"reconstruction 1 with 2 photos is read; {others}",)
     assert capture.frames[1].image == tmp_path / "images" / "ü.jpg"
     assert capture.kind == "opensfm"
     assert capture.unit == "arbitrary"

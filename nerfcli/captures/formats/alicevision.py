@@ -33,7 +33,7 @@ from nerfcli.captures.formats.fields import (
     size_of,
 )
 from nerfcli.captures.formats.format import Format, UserInputs, by_suffix, has_keys
-from nerfcli.captures.formats.limits import FramePoses
+from nerfcli.captures.formats.limits import FramePoses, without
 from nerfcli.captures.formats.photo_names import find_photos
 
 FILES = ("cameras.sfm", "sfm.sfm", "sfm.json")
@@ -70,13 +70,14 @@ def parse_alicevision(path: Path, given: UserInputs = UserInputs()) -> Capture:
     views = [(record_of(view, f"{path}: views[{i}]"), f"{path}: views[{i}]") for i, view in enumerate(content["views"])]
     paths = [name_of(view.get("path"), where) for view, where in views]
     folder = _common_folder(paths)
-    frames = []
+    frames, unposed = [], []
     for (view, where), place in zip(views, paths, strict=True):
         if "rigId" in view:
             raise malformed(where, "belongs to a camera rig", "rigs are not supported; convert to COLMAP in Meshroom")
         pose, camera = view.get("poseId"), view.get("intrinsicId")
         world_from_cam = poses.get(pose) if isinstance(pose, str) else None
         if world_from_cam is None:
+            unposed += [] if pose in poses else [place.removeprefix(folder)]
             continue
         if not isinstance(camera, str) or camera not in cameras:
             raise malformed(where, f"intrinsicId is {shown(camera)}", "expected the id of one of the intrinsics")
@@ -88,9 +89,8 @@ def parse_alicevision(path: Path, given: UserInputs = UserInputs()) -> Capture:
         name = frame.name.removeprefix(folder)
         frames[index] = replace(frame, name=name, image=image or (given.images or path.parent) / name)
     points, colours = _points(content.get("structure", []), f"{path}: structure")
-    return Capture(
-        tuple(frames), points, (), None, "alicevision", colours=colours, notes=(*found.notes, *usable.notes())
-    )
+    notes = (*found.notes, *usable.notes(), *without(unposed, "a pose"))
+    return Capture(tuple(frames), points, (), None, "alicevision", colours=colours, notes=notes)
 
 
 def _identified(records: list[Any], key: str, where: str) -> Iterator[tuple[str, dict[str, Any], str]]:
@@ -113,10 +113,10 @@ def _common_folder(paths: list[str]) -> str:
 
 
 def _numbers(value: Any, count: int, where: str) -> list[float]:
-    """Return a list of `count` numbers, which the file holds as texts."""
-    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+    """Return a list of `count` numbers, which the file holds as texts, or, once edited by a script, as numbers."""
+    if not isinstance(value, list) or not all(isinstance(item, str | int | float) for item in value):
         raise malformed(where, f"is {shown(value)}", f"expected a list of {count} numbers, as texts")
-    return numbers(value, count, where)
+    return numbers(list(map(str, value)), count, where)
 
 
 def _number(record: dict[str, Any], key: str, where: str, *, default: str | None = None) -> float:

@@ -21,7 +21,7 @@ from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import check_unique_names, content_lines, malformed, name_of, numbers, read_text
 from nerfcli.captures.formats.format import Format, UserInputs, by_suffix, only_file
-from nerfcli.captures.formats.limits import FramePoses
+from nerfcli.captures.formats.limits import FramePoses, without
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.orientation import stored_size
 
@@ -54,6 +54,7 @@ def parse_bundler(path: Path, given: UserInputs = UserInputs()) -> Capture:
             str(path), f"has {num_cameras} cameras, but {image_list} has {len(names)} images", _LIST_EXPECTED
         )
     registered = [index for index in range(num_cameras) if numbers(*_line(lines, 1 + 5 * index, 3, path))[0] != 0]
+    unregistered = [names[index] for index in sorted({*range(num_cameras)} - {*registered})]
     check_unique_names((names[index] for index in registered), image_list if registered else path)
     found = find_photos([names[index] for index in registered], (image_list.parent,), given=given.images)
     found = found.required(str(path), "the file does not give their sizes")
@@ -77,7 +78,7 @@ def parse_bundler(path: Path, given: UserInputs = UserInputs()) -> Capture:
         kind="bundler",
         colours=colours if num_points else None,
         observations=seen,
-        notes=(*found.notes, *poses.notes()),
+        notes=(*found.notes, *poses.notes(), *without(unregistered, "a pose")),
     )
 
 

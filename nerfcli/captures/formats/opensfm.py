@@ -37,7 +37,7 @@ from nerfcli.captures.formats.format import Format, find_json
 from nerfcli.captures.formats.limits import FramePoses, checked_camera, plausible
 from nerfcli.captures.formats.photo_names import with_photos
 from nerfcli.captures.formats.unsupported import distortion, lost_of_cameras, lost_parts, projection
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, several
 
 IMAGE_FOLDER = "images"
 
@@ -85,7 +85,7 @@ def parse_opensfm(path: Path) -> Capture:
     Raises:
         UserError: the file is damaged (file and field are named), or has a lens that no COLMAP model holds.
     """
-    content = _largest(path)
+    content, notes = _largest(path)
     camera_records = record_of(content.get("cameras"), f"{path}: cameras")
     cameras = {key: _camera(record, f"{path}: cameras.{shown(key)}") for key, record in camera_records.items()}
     frames, poses = [], FramePoses()
@@ -98,7 +98,7 @@ def parse_opensfm(path: Path) -> Capture:
         pose = poses.read_inverse(name, where, partial(_matrix, record, where))
         if pose is not None:
             frames.append(Frame(name, cameras[camera], pose, image=path.parent / IMAGE_FOLDER / name))
-    notes = poses.notes()
+    notes += poses.notes()
     check_unique_names((frame.name for frame in frames), path)
     points, colours = _points(content, path)
     unit = "metre" if _is_on_earth(content, path) else "arbitrary"
@@ -142,7 +142,8 @@ def _lost_of(camera: Camera) -> list[str]:
     return [name for name in distortion(camera) if name in _LOST_TERMS.get(camera.model, ())]
 
 
-def _largest(path: Path) -> dict[str, Any]:
+def _largest(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return the reconstruction with most shots, and a note on the others."""
     content = read_json(path, _EXPECTED)
     if not isinstance(content, list) or not content:
         raise malformed(str(path), f"holds {shown(content)}", _EXPECTED)
@@ -151,7 +152,13 @@ def _largest(path: Path) -> dict[str, Any]:
         shots = record_of(item.get("shots"), f"{path}: reconstruction {index}: shots")
         for key, shot in shots.items():
             record_of(shot, f"{path}: shots.{shown(key)}")
-    return max(content, key=lambda item: len(item["shots"]))
+    counts = [len(item["shots"]) for item in content]
+    best = counts.index(max(counts))
+    others = ", ".join(f"{index} with {count}" for index, count in enumerate(counts) if index != best)
+    what = (
+        f"reconstruction {best} with {several(counts[best], 'photo')} is read; others, which are in other coordinates"
+    )
+    return content[best], (f"{what}: {others}",) if others else ()
 
 
 def _camera(value: Any, where: str) -> Camera:
