@@ -25,7 +25,7 @@ def project(folder: Path) -> Path:
     ("files", "said"),
     [
         ((), "expected photos, such as .jpg, .png, .heic, "),
-        (("a.psd", "b.psd", "notes.txt"), "there are only 2 .psd, 1 .txt; expected photos, such as .jpg, "),
+        (("a.svg", "b.svg", "notes.txt"), "there are only 2 .svg, 1 .txt; expected photos, such as .jpg, "),
         (("DCIM/a.jpg",), "there are photos in {0}/DCIM; give that folder"),
     ],
 )

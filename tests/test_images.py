@@ -421,6 +421,10 @@ def test_float_pixels_are_named_as_the_reason(tmp_path, channels, kind):
         ("a.CR3", "is a raw file: develop it"),
         ("a.jxl", "is a JPEG XL file: convert"),
         ("a.exr", "has float pixels, whose white level is unknown"),
+        ("a.KDC", "is a raw file: develop it"),
+        ("a.psd", "is a picture of several layers: export it"),
+        ("a.jps", "holds the two pictures of a stereo camera"),
+        ("a.pcx", "is a picture in a format that is not read"),
     ],
 )
 def test_photos_in_formats_that_are_not_read_say_what_to_do(tmp_path, name, reason):
@@ -430,6 +434,16 @@ def test_photos_in_formats_that_are_not_read_say_what_to_do(tmp_path, name, reas
         read_image(tmp_path / name)
     assert list_images(tmp_path) == []
     assert [path.name for path in list_photos(tmp_path).unreadable] == [name]
+
+
+def test_16_bit_tiffs_in_which_white_is_0_are_inverted(tmp_path):
+    wide = np.array([[0, 256, 32768], [65279, 65280, 65535]], dtype=np.uint16)
+    path = tmp_path / "a.tif"
+    Image.fromarray(wide).save(path)
+    data, (black, white) = path.read_bytes(), (struct.pack("<HHII", 262, 3, 1, is_0) for is_0 in (1, 0))
+    assert data.count(black) == 1
+    path.write_bytes(data.replace(black, white))
+    np.testing.assert_array_equal(read_image(path)[..., 0], 255 - (wide >> 8))
 
 
 def downscaled_by_loops(image: np.ndarray, factor: float) -> np.ndarray:

@@ -23,6 +23,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
+from nerfcli.photos.unread import UNREAD
 
 HEIC_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
 # What every program reads; beside such a picture, one of the same name in another format is the same photo, converted.
@@ -63,19 +64,11 @@ _SAME_COLOUR_LEVELS = 2
 # zlib level, and PNG's filter "up": files are 9 % larger than with a filter chosen per line, but take half the time.
 _PNG_LEVEL, _PNG_UP = 4, 2
 _PNG_COLOURS = {1: 0, 3: 2, 4: 6}  # PNG's colour types by number of channels
-# Photos that are not read, by suffix, and why.
-_RAW = "is a raw file: develop it to JPEG or 16-bit TIFF"
-_FLOAT = "has float pixels, whose white level is unknown: save it with 8 or 16 bits per channel"
-_UNREAD = {
-    **dict.fromkeys((".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".raf", ".orf"), _RAW),
-    **dict.fromkeys((".rw2", ".pef", ".srw", ".x3f", ".3fr", ".iiq", ".rwl", ".gpr"), _RAW),
-    **dict.fromkeys((".exr", ".hdr", ".pfm"), _FLOAT),
-    ".jxl": "is a JPEG XL file: convert it to JPEG",
-    ".insp": "holds the two circles of a 360-degree camera: export it as one equirectangular picture",
-}
+_FLOAT = UNREAD[".exr"]
 # Files that are not counted among skipped ones: our list of a video's frames, and what systems leave behind.
 _OURS_OR_SYSTEM = frozenset({"frames.json", "Thumbs.db", "desktop.ini"})
 _SAMPLE_FORMAT, _FLOAT_SAMPLES = 339, 3  # a tag of TIFF, and its value for float
+_PHOTOMETRIC, _WHITE_IS_ZERO = 262, 0
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -209,8 +202,8 @@ def _check_pixels(image: np.ndarray) -> None:
 @contextmanager
 def opened(path: Path) -> Iterator[Image.Image]:
     """Open a file as a lazy Pillow image; errors of the file inside the block become a UserError."""
-    if path.suffix.lower() in _UNREAD:
-        raise UserError(f"{path} {_UNREAD[path.suffix.lower()]}", _OR_REMOVE)
+    if path.suffix.lower() in UNREAD:
+        raise UserError(f"{path} {UNREAD[path.suffix.lower()]}", _OR_REMOVE)
     try:
         if path.stat().st_size == 0:
             raise UserError(f"{path} is empty (0 bytes)", "copy the photo again, or remove the file")
@@ -277,10 +270,13 @@ def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
     """Return a loaded image in mode RGB or RGBA, in the sRGB colour space."""
     profile = image.info.get("icc_profile")
     mode = "RGBA" if image.has_transparency_data else "RGB"
+    is_inverted = getattr(image, "tag_v2", {}).get(_PHOTOMETRIC) == _WHITE_IS_ZERO  # a TIFF
     # A 16-bit PNG is "I" in older releases of Pillow, and a 16-bit PGM in all.
     if image.mode.startswith("I;16") or (image.mode == "I" and image.format in ("PNG", "PPM")):
         # Keep the high byte, as Pillow does for 16-bit colour; this is exact for 8-bit pixels that were widened to 16.
-        image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+        high = (np.asarray(image) >> 8).astype(np.uint8)
+        # Of 8 bits, Pillow itself inverts levels whose white is 0.
+        image = Image.fromarray(255 - high if is_inverted else high)
     if image.mode in ("I", "F"):
         kind = "integer" if image.mode == "I" else "float"
         what = f"{path} has 32-bit {kind} pixels, whose white level is unknown"
@@ -397,4 +393,4 @@ def _unreadable(folder: Path) -> list[Path]:
     read = {path.stem for path in list_images(folder)}
     files = [path for path in folder.iterdir() if not path.name.startswith(".") and path.stem not in read]
     broken = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES and not path.exists()]
-    return [*(path for path in files if path.suffix.lower() in _UNREAD), *broken]
+    return [*(path for path in files if path.suffix.lower() in UNREAD), *broken]
