@@ -142,13 +142,16 @@ def test_cameras_by_hand(tmp_path):
         '<group id="0" label="Group 1" type="folder">' + camera_xml("DCIM/b c.jpg") + "</group>",
         camera_xml("ü"),
         camera_xml("not aligned", pose=None),
+        camera_xml("empty", pose=None).replace("<orientation>", "<transform></transform><orientation>"),
         camera_xml("disabled", more=' enabled="false"'),
     )
     capture = parse_metashape(write(tmp_path, document(sensor_xml({"f": 500.0}), "".join(cameras))))
     assert [(frame.name, frame.image) for frame in capture.frames] == [("DCIM/b c.jpg", None), ("ü", None)]
     assert (capture.kind, capture.unit, capture.missing) == ("metashape", "arbitrary", ())
-    left_out = (("not aligned", "not aligned"), ("disabled in Metashape", "disabled"))
-    assert capture.notes == tuple(f"1 of 4 cameras left out, {reason}: {name}" for reason, name in left_out)
+    assert capture.notes == (
+        "2 of 5 cameras left out, not aligned: not aligned, empty",
+        "1 of 5 cameras left out, disabled in Metashape: disabled",
+    )
     np.testing.assert_allclose(capture.frames[0].world_from_cam, CHUNK_FROM_CAM, rtol=0, atol=1e-15)
 
 

@@ -113,7 +113,7 @@ def _unusable(camera: Element, sensors: Mapping[str | None, Element]) -> str:
         return "disabled in Metashape"
     if not (camera.get("label") or "").strip():
         return "without a label"
-    if camera.find("transform") is None:
+    if not _words(camera, "transform"):
         return "not aligned"
     sensor = sensors.get(camera.get("sensor_id"))
     calibrated = sensor is None or _calibration(sensor).find("f") is not None or _kind_of(sensor) == _SPHERICAL
@@ -146,7 +146,7 @@ def _chunk(path: Path) -> tuple[Element, list[str]]:
     if not chunks:
         raise malformed(str(path), f"has no chunk element, but a {shown(root.tag)}", _EXPECTED)
     names = [f"{number} ({chunk.get('label', '')})" for number, chunk in enumerate(chunks, start=1)]
-    aligned = [len(chunk.findall("cameras//camera/transform")) for chunk in chunks]
+    aligned = [sum(bool(_words(one, "transform")) for one in chunk.iterfind("cameras//camera")) for chunk in chunks]
     best = aligned.index(max(aligned))
     return chunks[best], _one_of("chunk", dict(zip(names, aligned, strict=True)), names[best])
 
