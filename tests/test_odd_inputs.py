@@ -30,6 +30,7 @@ from nerfcli.captures.formats.colmap import write_colmap_binary, write_colmap_te
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.lenses import Fits, Terms
 from nerfcli.captures.formats.photo_names import find_photos
+from nerfcli.captures.formats.ply import write_points
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.errors import BAD_INPUT, UserError
 
@@ -469,6 +470,14 @@ def test_two_keys_that_give_different_focal_lengths_are_said(tmp_path):
     assert len(read_again(tmp_path, same).frames) == COUNT - 1
 
 
+@pytest.mark.parametrize("listed", ["C:\\out\\points.ply", "Points.PLY", "file:///out/points.ply"])
+def test_a_cloud_of_points_is_found_beside_the_file(listed, tmp_path):
+    write_points(CAPTURE, tmp_path / "points.ply")
+    capture = read_again(tmp_path, written(tmp_path, ply_file_path=listed))
+    np.testing.assert_array_equal(capture.points, CAPTURE.points)
+    assert capture.notes == ()
+
+
 def test_empty_texts_of_a_template_are_no_numbers_and_no_masks(tmp_path):
     content = written(tmp_path, k1="", k2="", camera_angle_x="", camera_model=" pinhole ", mask_path=" ")
     capture = read_again(tmp_path, content)
@@ -631,6 +640,22 @@ def test_a_sphere_that_is_not_two_to_one_is_refused(form, tmp_path):
     with pytest.raises(UserError, match="EQUIRECTANGULAR picture: 640x480") as caught:
         parsed(tmp_path)
     assert "twice as wide as high" in caught.value.hint
+
+
+@pytest.mark.parametrize("form", ["transforms", "colmap"])
+def test_ordinary_photos_of_a_spherical_camera_are_refused(form, tmp_path):
+    photos(tmp_path / "images", numbered("{}.png"))
+    if form == "transforms":
+        content = transforms_record(numbered("images/{}.png"), camera_model="equirectangular", w=640, h=320)
+        (tmp_path / "transforms.json").write_text(json.dumps(content))
+    else:
+        colmap(tmp_path, numbered("{}.png"))
+        (tmp_path / "sparse/0/cameras.txt").write_text("1 EQUIRECTANGULAR 640 320 640 320\n")
+    for command in (["convert", tmp_path, tmp_path / "out.json", "--to", "transforms"], ["info", tmp_path]):
+        refused = nerfcli(*command)
+        assert refused.exit_code == BAD_INPUT
+        assert "0.png: a picture of 640x480 pixels does not match a camera of 640x320" in error_of(refused)[0]
+        assert "twice as wide as high" in refused.stderr
 
 
 # Lenses

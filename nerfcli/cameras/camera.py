@@ -229,8 +229,12 @@ class Camera:
         if (width, height) == (self.width, self.height):
             return self
         if not self.has_shape(width, height):
+            what = f"a picture of {width}x{height} pixels does not match a camera of {self.width}x{self.height} pixels"
+            if self.is_spherical:
+                hint = "EQUIRECTANGULAR pictures are twice as wide as high; ordinary photos have another camera model"
+                raise UserError(what, hint)
             raise UserError(
-                f"a picture of {width}x{height} pixels does not match a camera of {self.width}x{self.height} pixels",
+                what,
                 "the aspect ratios differ: the picture was cropped or rotated, not resized; use the picture that the "
                 "camera was calibrated with",
             )

@@ -240,7 +240,9 @@ def _points_beside(path: Path, content: dict[str, Any]) -> tuple[np.ndarray, np.
         return np.zeros((0, 3)), None, ()
     if not isinstance(cloud, str):
         raise malformed(str(path), f"ply_file_path is {cloud!r:.80}", "expected the path of a PLY file as text")
-    places = (path.parent / plain_name(cloud), path.parent / PurePosixPath(plain_name(cloud)).name)
+    name = PurePosixPath(plain_name(cloud)).name
+    same = (there for there in sorted(path.parent.iterdir()) if there.name.lower() == name.lower())
+    places = (path.parent / plain_name(cloud), path.parent / name, *same)
     place = next((place for place in places if place.is_file()), None)
     if place is None:
         return np.zeros((0, 3)), None, (f"{cloud}, which {path.name} names, does not exist: no points are read",)
