@@ -722,6 +722,19 @@ def test_masks_that_are_missing_are_left_out_and_named(tmp_path):
     assert capture.notes == ("1 mask named in transforms.json left out, not found: masks/1.png",)
 
 
+def test_depth_maps_under_other_names_and_those_that_are_missing(tmp_path):
+    content = written(tmp_path)
+    photos(tmp_path, ["depth/0.png", "depth/1.png", "depth/0 left.png"])
+    (tmp_path / "depth/2.npy").touch()
+    named = ("C:\\x\\depth\\0.png", "depth\\1.PNG", "depth/2.npy", "depth/3.png", "", None)
+    for frame, depth in zip(content["frames"], named, strict=False):
+        frame["depth_file_path"] = depth
+    capture = read_again(tmp_path, content)
+    maps = [None if frame.depth is None else frame.depth.path for frame in capture.frames]
+    assert maps == [*(tmp_path / "depth" / name for name in ("0.png", "1.png", "2.npy")), *[None] * (COUNT - 3)]
+    assert capture.notes == ("1 depth map named in transforms.json left out, not found: depth/3.png",)
+
+
 def test_equal_labels_of_metashape_are_told_apart_by_their_groups(tmp_path):
     put("metashape", tmp_path)
     path = tmp_path / "cameras.xml"

@@ -157,7 +157,10 @@ def listed_frames(
     ]
     places = [image or home / name for name, image in zip(names, found.paths, strict=True)]
     known = _known_sizes(sizes, places, listed[0][1], default=size)
-    masks, lost_masks = _masks(path, listed, home, folders[1], photos=set(places))
+    masks, lost_masks = _beside(path, listed, "mask_path", "mask", places=(home, folders[1]), photos=set(places))
+    depths, lost_depths = _beside(
+        path, listed, "depth_file_path", "depth map", places=(home, "depth"), photos=set(places)
+    )
     splits = _listed_splits(path, content)
     cameras: dict[Camera, Camera] = {}
     fits, poses = Fits(), FramePoses()
@@ -171,36 +174,41 @@ def listed_frames(
         if world_from_cam is None:
             continue
         camera, pose = camera_of_record(record, own_size, where, fits), opencv_pose(world_from_cam, "opengl")
-        split, depth = splits.get(plain_name(texts[index])), _listed_depth(home, record, where)
+        split, map_path = splits.get(plain_name(texts[index])), depths[index]
+        depth = None if map_path is None else SensorDepth(map_path, MILLIMETRE)  # nerfstudio's default unit
         camera = cameras.setdefault(camera, camera)
         frames.append(Frame(names[index], camera, pose, places[index], masks[index], split=split, depth=depth))
         used.append((record, where, own_size))
-    notes = (*found.notes, *poses.notes(), *contradictions(used), *fits.notes(), *lost_masks)
+    notes = (*found.notes, *poses.notes(), *contradictions(used), *fits.notes(), *lost_masks, *lost_depths)
     return frames, missing, notes
 
 
-def _masks(
-    path: Path, listed: Sequence[tuple[dict[str, Any], str]], home: Path, folder: str, *, photos: set[Path]
+def _beside(
+    path: Path,
+    listed: Sequence[tuple[dict[str, Any], str]],
+    key: str,
+    noun: str,
+    *,
+    places: tuple[Path, str],
+    photos: set[Path],
 ) -> tuple[list[Path | None], tuple[str, ...]]:
-    """Return the mask of each frame, None without one or where it is not on disk, and what was left out."""
-    texts = [record.get("mask_path") or "" for record, _ in listed]
-    for mask, (_, where) in zip(texts, listed, strict=True):
-        if not isinstance(mask, str):
-            raise malformed(where, f"mask_path is {mask!r:.80}", "expected the mask's path as text")
-    named = {mask for mask in texts if mask.strip()}
-    found = find_photos(sorted(named), (home,), folders=(folder,), others=())
-    paths = {name: image for name, image in zip(found.listed, found.paths, strict=True) if image not in photos}
+    """Return the mask or depth map that each frame names under a key, None if it is not on disk, and what is lost.
+
+    Args:
+        noun: what it is.
+        places: the folder that paths are relative to, and the usual name of the folder of these files in it.
+        photos: none of which it can be.
+    """
+    texts = [record.get(key) or "" for record, _ in listed]
+    for text, (_, where) in zip(texts, listed, strict=True):
+        if not isinstance(text, str):
+            raise malformed(where, f"{key} is {text!r:.80}", f"expected the path of a {noun} as text")
+    named = {text for text in texts if text.strip()}
+    found = find_photos(sorted(named), (places[0],), folders=(places[1],), others=())
+    paths = {name: file for name, file in zip(found.listed, found.paths, strict=True) if file not in photos}
     lost = sorted(name for name in named if paths.get(name) is None)
-    notes = (f"{several(len(lost), 'mask')} named in {path.name} left out, not found: {in_words(lost)}",)
-    return [paths.get(mask) if mask else None for mask in texts], notes if lost else ()
-
-
-def _listed_depth(folder: Path, record: dict[str, Any], where: str) -> SensorDepth | None:
-    """Return the depth map of a frame, in nerfstudio's default unit; None if it has none on disk."""
-    listed = record.get("depth_file_path")
-    if listed is not None and not isinstance(listed, str):
-        raise malformed(where, f"depth_file_path is {listed!r:.80}", "expected the path of a depth map as text")
-    return SensorDepth.found(folder / listed.replace("\\", "/"), unit=MILLIMETRE) if listed else None
+    notes = (f"{several(len(lost), noun)} named in {path.name} left out, not found: {in_words(lost)}",)
+    return [paths.get(text) for text in texts], notes if lost else ()
 
 
 def relative_path(frame: Frame, folder: Path) -> str:
