@@ -127,7 +127,7 @@ def read_sound_scan(folder: Path) -> None:
     assert np.isfinite(scan.line_integrals(np.arange(scan.geometry.views))).all()
 
 
-# Half of the damage to these changes a digit, which gives another sound number. Which damage that is depends on the last
+# Half of the damage to these changes a digit, which gives another sound number. How much does so depends on the last
 # digits of the sample, and these on the processor: 74 and 77 of 150 are refused on a Xeon.
 MOSTLY_DIGITS = ("colmap-text", "kapture")
 SAMPLES: dict[str, Sample] = {
