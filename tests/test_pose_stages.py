@@ -288,6 +288,14 @@ def test_a_disk_that_is_full_when_a_scene_is_replaced_leaves_the_earlier_one(
     assert is_same_scene(again, photos, ONE_THREAD)
 
 
+@pytest.mark.usefixtures("same_process")
+def test_a_split_that_holds_out_no_placed_photo_leaves_an_earlier_scene(photos: Path, again: Path, tmp_path: Path):
+    (tmp_path / "test.txt").write_text("wall.png")
+    with pytest.raises(UserError, match=r"holds out 0 of 7 photos"):
+        estimate(photos, again, replace(ONE_THREAD, holdout=str(tmp_path / "test.txt")))
+    assert is_same_scene(again, photos, ONE_THREAD)
+
+
 def test_a_backup_of_a_database_is_not_removed_with_it(tmp_path: Path):
     kept = {"database.db.bak", "database.db-copy"}
     for name in (*kept, "database.db", "database.db-wal", "database.db-shm", "database.db-journal"):

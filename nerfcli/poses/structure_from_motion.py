@@ -94,7 +94,8 @@ def estimate_poses(
             if not (settings.accept_refused and report.models):
                 raise _refused(add_advice(error, report.moving_foreground), report, scene_dir)
             notify(f"accepted because of --accept-refused: {error.message}")
-        publish(scene_dir, lambda: _describe_scene(report, scene_dir, photos_dir, given=given))
+        split = _split(report)  # may be refused: an earlier scene is still there
+        publish(scene_dir, lambda: _describe_scene(report, scene_dir, photos_dir, split=split, given=given))
     for note in closing_notes(report):
         notify(note)
     return report
@@ -188,7 +189,14 @@ def _lay_out(
     return move_held_out_last(job)
 
 
-def _describe_scene(report: PosesReport, scene_dir: Path, photos_dir: Path, *, given: Calibration | None) -> None:
+def _describe_scene(
+    report: PosesReport,
+    scene_dir: Path,
+    photos_dir: Path,
+    *,
+    split: dict[str, str | None],
+    given: Calibration | None,
+) -> None:
     """Write poses_report.json and scene.json."""
     write_json(scene_dir / "poses_report.json", report.to_json())
     provenance = {"command": "poses", "settings": asdict(report.settings), "versions": report.versions}
@@ -201,7 +209,7 @@ def _describe_scene(report: PosesReport, scene_dir: Path, photos_dir: Path, *, g
         unit="arbitrary",
         masks=_masks_of(report, scene_dir),
         depths=depths_beside(photos_dir),
-        split=_split(report),
+        split=split,
     )
 
 
@@ -214,7 +222,11 @@ def _masks_of(report: PosesReport, scene_dir: Path) -> Path | None:
 
 
 def _split(report: PosesReport) -> dict[str, str | None]:
-    """Return which of the placed photos are for training and which for testing."""
+    """Return which of the placed photos are for training and which for testing.
+
+    Raises:
+        UserError: all of them, or none, are held out.
+    """
     placed = [image.name for image in report.images if image.registered]
     if report.strict is not None:
         test = frozenset(report.strict["placed"])
