@@ -310,6 +310,12 @@ class TestKapture:
         text(home / "trajectories.txt", "\n".join([*rows[:2], "0001, cam0, , , , , 1, 2, 3"]))
         assert parse(tmp_path).notes == ("1 photo without a pose left out: walk/1.jpg",)
 
+    def test_a_pose_with_a_decimal_comma_is_refused(self, tmp_path):
+        path = WITH_PHOTOS["kapture"](VIEWS, tmp_path)
+        text(path, "0000, cam0, 0,5, 0.5, 0.5, 0.5, 1, 2, 3\n0001, cam0, 0.5, 0.5, 0.5, 0.5, 1, 2, 3\n")
+        with pytest.raises(UserError, match=r"trajectories.txt: line 1: has 8 numbers"):
+            parse(tmp_path)
+
 
 class TestStrayScanner:
     def test_the_frames_of_the_video_are_the_photos(self, tmp_path):

@@ -98,8 +98,8 @@ def _pose_at(
 
 def _transform(row: Row) -> np.ndarray | None:
     """Return the transform (4, 4) of a row's last seven cells; None if a part of it is not known."""
-    cells = row.cells[2:9]
-    if not all(cells):
+    cells = row.cells[2:]
+    if not all(cells[:7]):
         return None
     values = np.array(numbers(cells, 7, row.where))
     if not values[:4].any():
