@@ -257,7 +257,7 @@ def test_splats_of_a_run_in_a_read_only_folder_are_exported(run: Path, monkeypat
     nerfcli.export_run(
         run, Output(run.with_name("r.ply")), to="splats", splats=other, reporter=Reporter(note=told.append)
     )
-    assert f"the splats are not kept in the run: cannot write {run / SPLATS}: Read-only file system" in told
+    assert f"the splats could not be saved in the run: cannot write {run / SPLATS}: Read-only file system" in told
     assert len(nerfcli.load_splats(run.with_name("r.ply")).gaussians) <= 700
 
 

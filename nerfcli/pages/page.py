@@ -168,7 +168,7 @@ def _origin_html(origin: str) -> str:
 
 
 def claim_page(output: Output, path: Path, mark: Mark, *, about: str) -> None:
-    """Raise if a page cannot be written at a path, or something is there that may not be replaced.
+    """Raise an error if a page cannot be written to a path, or a file there must not be replaced.
 
     Pages with the same mark may always be replaced.
 

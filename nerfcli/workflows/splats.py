@@ -183,12 +183,12 @@ def run_splats(run: Run, model: Model, *, settings: SplatSettings, reporter: Rep
         )
         try:
             save_splats(run.path / SPLATS, splats)
-        except UserError as error:  # the splats of runs in read-only folders can be exported, too
-            reporter.note(f"the splats are not kept in the run: {error.message}")
+        except UserError as error:  # splats of a run in a read-only folder can still be exported
+            reporter.note(f"the splats could not be saved in the run: {error.message}")
         else:
             if interrupts.came is not None:
-                again = "run" if settings.resume is None else "add --resume to"
-                reporter.note(f"the splats are saved; to continue, {again} the same command")
+                todo = "repeat the command" if settings.resume is None else "add --resume to the same command"
+                reporter.note(f"the splats are saved; to continue, {todo}")
         interrupts.raise_if_pending()
     reporter.note(compared_in_words(model, loaded, splats))
     return splats

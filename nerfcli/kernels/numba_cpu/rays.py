@@ -137,12 +137,6 @@ def cube(x: Any, y: Any, z: Any, contraction: Any) -> Any:
     return x * scale + half, y * scale + half, z * scale + half
 
 
-@numba.njit(inline="always")
-def cut(walk: Any, ray: Any, k: Any) -> Any:
-    """Return the jittered edge number k of a ray."""
-    return walk.edges[k] + walk.jitter[ray] * (walk.edges[k + 1] - walk.edges[k])
-
-
 class Walk(NamedTuple):
     """Rays and a march through cells, as compiled loops take them.
 
@@ -179,6 +173,12 @@ def walk_of(rays: Rays, along: March, *, has_width: bool = False) -> Walk:
         side=along.occupied.shape[0],
         contraction=CONTRACTIONS.index(along.contraction),
     )
+
+
+@numba.njit(inline="always")
+def cut(walk: Any, ray: Any, k: Any) -> Any:
+    """Return the jittered edge number k of a ray."""
+    return walk.edges[k] + walk.jitter[ray] * (walk.edges[k + 1] - walk.edges[k])
 
 
 @numba.njit(inline="always")

@@ -72,11 +72,8 @@ def new_round(walk: Any) -> Any:
     lanes = Lanes(np.full(LANES, -1, np.int64), np.zeros(LANES, np.int64), np.zeros(LANES), np.zeros(LANES, np.int64))
     look = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32), np.empty(WINDOW, np.float32)
     widths = np.empty(ROUND if walk.cones.shape[0] > 0 else 0, np.float32)
-    return (
-        lanes,
-        look,
-        Round(np.empty(ROUND, np.int64), np.empty((ROUND, 2), np.float32), np.empty((3, ROUND), np.float32), widths),
-    )
+    lane, span, points = np.empty(ROUND, np.int64), np.empty((ROUND, 2), np.float32), np.empty((3, ROUND), np.float32)
+    return lanes, look, Round(lane, span, points, widths)
 
 
 @numba.njit(nogil=True, error_model="numpy")
