@@ -9,6 +9,7 @@ import torch
 
 from nerfcli.kernels.interface import RayTermination, SplatView
 from nerfcli.kernels.numba_cpu import machine_code, splat_compositing
+from nerfcli.kernels.numba_cpu.similarity import similarity_gradient
 from nerfcli.kernels.numba_cpu.splat_compositing import into_tiles
 from nerfcli.kernels.numba_cpu.splat_gradient import BUFFER, gather_lane, gradient_of_lane, gradients_of_lanes
 from nerfcli.kernels.numba_cpu.splat_projection import (
@@ -224,4 +225,5 @@ def prepare_splats(notify: Callable[[str], None]) -> None:
     splat_gradients(picture, nothing, picture.transmittance)
     adam = SplatAdam(np.zeros_like(rows), np.zeros_like(rows), np.zeros(1, np.int32))
     rates, sizes = np.zeros(6, np.float32), np.zeros(1, np.float32)
-    step_splats(picture, nothing, picture.transmittance, adam, rates=rates, sizes=sizes, betas=(0.9, 0.99))
+    by_image = similarity_gradient(picture.image, nothing)
+    step_splats(picture, by_image, picture.transmittance, adam, rates=rates, sizes=sizes, betas=(0.9, 0.99))
