@@ -133,7 +133,7 @@ class Measurement:
         return {errors.depth: asdict(errors) for errors in found if errors.depth in DEPTHS}
 
     def splats(self, name: str, budget: float) -> Cell:
-        """Export splats in every format and the page of the field, and compare them with the field."""
+        """Export splats in every format, and compare them with the field."""
         run = self.trained(name, budget)
         common = ("--threads", str(THREADS), "--quiet")
         files = {suffix: run.with_name(f"{run.name}-splats.{suffix}") for suffix in ("ply", "spz", "html")}
@@ -141,19 +141,31 @@ class Measurement:
             nerfcli(
                 "export", str(run), "--to", "splats", "-o", str(file), "--budget", SPLATS_BUDGET, "--overwrite", *common
             )
-        files["page"] = run.with_name(f"{run.name}.html")
-        nerfcli("export", str(run), "--to", "page", "-o", str(files["page"]), "--overwrite", *common)
         (field, ply), (_, spz) = (self.beside_field(run, files[suffix]) for suffix in ("ply", "spz"))
         return {
             "field_psnr": field["mean"]["psnr"],
+            "field_ssim": field["mean"]["ssim"],
             "count": ply["splats"]["count"],
             "psnr": ply["mean"]["psnr"],
             "ssim": ply["mean"]["ssim"],
             "spz_psnr": spz["mean"]["psnr"],
             "render_s": ply["render"]["seconds_per_image"],
             **{f"{kind}_mb": file.stat().st_size / 1e6 for kind, file in files.items()},
-            "page_psnr": self.page_psnr(files["page"]),
         }
+
+    def page(self, name: str, budget: float) -> Cell:
+        """Export the page of a field, and compare its pictures with those of `nerfcli render`."""
+        from browser import Browser
+
+        run = self.trained(name, budget)
+        page = run.with_name(f"{run.name}.html")
+        nerfcli(
+            "export", str(run), "--to", "page", "-o", str(page), "--overwrite", "--threads", str(THREADS), "--quiet"
+        )
+        with Browser(self.folder / "browser") as browser:
+            browser.open(page, "#check")
+            found = json.loads(browser.wait("document.getElementById('checked').dataset.found", seconds=600))
+        return {"page_mb": page.stat().st_size / 1e6, "page_psnr": -20 * math.log10(found["colour"]["rms"])}
 
     def beside_field(self, run: Path, splats: Path) -> list[Cell]:
         """Return the metrics of a field and of splats."""
@@ -161,17 +173,13 @@ class Measurement:
         lines = nerfcli("evaluate", str(run), "--splats", str(splats), "--threads", str(THREADS), "--json", "--quiet")
         return [json.loads(line) for line in lines.splitlines()]
 
-    def page_psnr(self, page: Path) -> float:
-        """Return the PSNR of a page's pictures against `nerfcli render`; NaN without a browser on the PATH."""
-        sys.path.append(str(ROOT / "tests"))
-        from browser import Browser, find_browser
 
-        if find_browser() is None:
-            return math.nan
-        with Browser(self.folder / "browser") as browser:
-            browser.open(page, "#check")
-            found = json.loads(browser.wait("document.getElementById('checked').dataset.found", seconds=600))
-        return -20 * math.log10(found["colour"]["rms"])
+def has_browser() -> bool:
+    """Return whether pages can be opened."""
+    sys.path.append(str(ROOT / "tests"))
+    from browser import find_browser
+
+    return find_browser() is not None
 
 
 def plan(names: Iterable[str], budgets: Sequence[float]) -> Iterator[tuple[str, str, float]]:
@@ -184,6 +192,7 @@ def plan(names: Iterable[str], budgets: Sequence[float]) -> Iterator[tuple[str, 
         if budget == usual:
             yield from (("depth", name, budget) for name in names if CAPTURES[name].depth)
             yield from (("splats", name, budget) for name in names)
+            yield from (("page", name, budget) for name in names if has_browser())
 
 
 def read_cells(path: Path) -> list[Cell]:
