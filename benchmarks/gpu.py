@@ -244,10 +244,9 @@ def whole_step(capture: Path, device: Any, batch: int, sizes: Sizes) -> dict[str
 def quality(capture: Path, device: str, seconds: int, folder: Path, *, dry: bool) -> dict[str, float]:
     """Return held-out PSNR after a training of `seconds`."""
     import nerfcli
-    from nerfcli.training.runs.settings import TrainSettings, sizes_for
+    from nerfcli.training.runs.settings import TrainSettings
 
     settings = TrainSettings(budget_seconds=float(seconds), device=device, threads=os.cpu_count() or 1)
-    settings = replace(settings, **sizes_for(device))
     if dry:
         settings = replace(settings, budget_seconds=None, steps=2, downscale=8)
     output = nerfcli.Output(folder / f"{device.replace(':', '-')}-{seconds}", overwrite=True)

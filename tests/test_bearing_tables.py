@@ -119,5 +119,5 @@ def test_a_step_of_a_network_needs_its_neurons():
         for size in (2**18, 2**26)
     )
     width = (2**26 / 4 / 3.5) ** 0.5
-    more = 7 * (2**26 - 2**18) + TrainSettings().samples_per_step * 4 * 2 * 4 * width * (1 - 1 / 16)
+    more = 7 * (2**26 - 2**18) + TrainSettings().samples[1] * 4 * 2 * 4 * width * (1 - 1 / 16)
     assert large - small == pytest.approx(more, rel=0.1)

@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import psutil
@@ -17,7 +18,7 @@ from nerfcli.bench import measurement
 from nerfcli.errors import UserError
 from nerfcli.kernels import describe_machine
 from nerfcli.machine import default_memory_limit, device_name, keep_freed_memory, return_freed_memory, thread_count
-from nerfcli.training.runs.settings import TrainSettings, sizes_for
+from nerfcli.training.runs.settings import TrainSettings
 
 
 @pytest.fixture
@@ -65,9 +66,9 @@ def test_a_benchmark_names_the_gpu_and_reads_its_memory(monkeypatch):
 
 
 def test_a_gpu_gets_larger_steps_and_tables():
-    assert sizes_for("cpu") == {}
-    sized = TrainSettings(**sizes_for("cuda:1"))
-    assert (sized.first_samples_per_step, sized.samples_per_step, sized.log2_rows) == (2**16, 2**18, 19)
+    sized = TrainSettings(device="cuda:1")
+    assert (sized.samples, sized.chosen_log2_rows) == ((2**16, 2**18), 19)
+    assert replace(sized, device="cpu").samples == (2**13, 2**16)
 
 
 def test_a_machine_with_gpus_says_what_runs_on_each_and_why(two_gpus):

@@ -144,7 +144,8 @@ def test_a_step_waits_once_for_the_device(components, most, waits, spheres: Capt
     photos = load_photos(spheres.train_frames[:3], factor=4, threads=1)
     opaque = [photo.__class__(photo.frame, photo.pixels[..., :3].copy(), photo.used) for photo in photos]
     pool = PixelPool(opaque, Similarity(1.0, np.eye(3), np.zeros(3)), GPU)
-    settings = TrainSettings(budget_seconds=None, steps=40, components=components, device="cuda", samples_per_step=2**9)
+    few = {"budget_seconds": None, "steps": 40, "samples_per_step": 2**9, "log2_rows": 16}
+    settings = TrainSettings(components=components, device="cuda", **few)
     depths = [PointDepths(*(torch.zeros(9, device=GPU).to(t) for t in (torch.int64, torch.float32, torch.float32)))]
     extent = Extent("l2", Similarity.identity(), Marching(0.1, 4.0, 0.05, 0.0))
     fitting = Fitting(TrainingInputs(settings, extent, pool, points=PointRays(depths, pool)))

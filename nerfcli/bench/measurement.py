@@ -36,7 +36,7 @@ from nerfcli.render.pictures import RenderedPicture, render_picture
 from nerfcli.render.tracing import TOLERANCE
 from nerfcli.training.loop import Progress, train
 from nerfcli.training.runs.run import Run
-from nerfcli.training.runs.settings import TrainSettings, sizes_for
+from nerfcli.training.runs.settings import TrainSettings
 
 # A training shorter than this learns too little to tell settings apart.
 SHORTEST_TRAINING_SECONDS = 8.0
@@ -82,10 +82,8 @@ class TrainSetting:
 
     def settings(self, base: TrainSettings, seconds: float) -> TrainSettings:
         """Return the settings of the training, if one of fraction 1 takes these seconds."""
-        values = dict(self.changed)
-        if "samples_per_step" in values:
-            values["first_samples_per_step"] = min(base.first_samples_per_step, values["samples_per_step"])
-        return replace(base, budget_seconds=self.fraction * seconds, steps=None, **values)  # type: ignore[arg-type]
+        changed = dict(self.changed)
+        return replace(base, budget_seconds=self.fraction * seconds, steps=None, **changed)  # type: ignore[arg-type]
 
 
 def render_settings(threads: int) -> list[RenderSetting]:
@@ -280,7 +278,7 @@ def measure_trainings(
             f"{scene.root} has no held-out photos", "its split lists none: name some, such as every 8th photo"
         )
     device = resources.torch_device
-    base = TrainSettings(device=device, threads=resources.cores, **sizes_for(device))
+    base = TrainSettings(device=device, threads=resources.cores)
     chosen, unit = affordable(train_settings(), seconds, overhead=6.0)
     points: list[Point] = []
     memory, folder = PeakMemory(device), work / WORK

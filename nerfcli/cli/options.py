@@ -159,7 +159,7 @@ class Training(Computing):
         Raises:
             typer.BadParameter: a value cannot be parsed.
         """
-        from nerfcli.training.runs.settings import TrainSettings, sizes_for
+        from nerfcli.training.runs.settings import TrainSettings
 
         return TrainSettings(
             budget_seconds=None if budget is None else seconds_from_text(budget),
@@ -169,7 +169,6 @@ class Training(Computing):
             device=self.resources.torch_device,
             threads=self.resources.cores,
             model="auto",
-            **sizes_for(self.resources.torch_device),
         )
 
 

@@ -86,7 +86,6 @@ class Fit:
         excluded = [*(self.exclude or ()), *([] if self.sensor_depth else ["sensor"])]
         budget = DEFAULT_BUDGET if self.budget is None and self.steps is None else self.budget
         sized = training.settings(budget, self.steps)
-        largest = self.batch or sized.samples_per_step
         size = None if self.field_memory is None else options.bytes_from_text(self.field_memory, "--field-memory")
         return replace(
             sized,
@@ -94,9 +93,8 @@ class Fit:
             components=choose(Components(), included=self.include or (), excluded=excluded),
             model=options.one_of(self.model, ("auto", "default"), "--model"),
             fixed=options.named_components(self.include, excluded),
-            first_samples_per_step=min(sized.first_samples_per_step, largest),
-            samples_per_step=largest,
-            log2_rows=self.log2_rows or sized.log2_rows,
+            samples_per_step=self.batch,
+            log2_rows=self.log2_rows,
             field=options.one_of(self.field or "hash", KINDS, "--field"),
             field_memory_bytes=size,
         )

@@ -129,7 +129,7 @@ class Fitting:
         self.ray_steps = RaySteps(self.extent, self.field.settings, device)
         rows = self.field.rows()
         most_rays = MOST_RAYS if rows is None else max(MOST_RAYS, rows.shape[-2] // ROWS_PER_RAY)
-        self._most_rays = most_rays if device.type == "cpu" else max(most_rays, settings.samples_per_step // 4)
+        self._most_rays = most_rays if device.type == "cpu" else max(most_rays, settings.samples[1] // 4)
         self.generator = torch.Generator(device=device).manual_seed(settings.seed)
         self.optimiser = FieldOptimiser(self.field)
         self.parts_optimiser = PartsOptimiser(self.appearance.groups())

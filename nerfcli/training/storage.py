@@ -61,7 +61,7 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
     # The field, its gradient and two moments, and the sentinel's copy of all of these except the gradient.
     field = planned_field(settings)
     neurons = field.layers * field.width if isinstance(field, FourierFieldSettings) else 0
-    step = 7 * parameter_bytes(field) + (6000 + 4 * 2 * neurons) * settings.samples_per_step
+    step = 7 * parameter_bytes(field) + (6000 + 4 * 2 * neurons) * settings.samples[1]
     # Before there is a field, stereo matching has the directions from all photos to all points, float64 and float32.
     has_stereo = selects or components.stereo or components.occluders or components.exposure == "matched"
     stereo = 36 * len(frames) * MOST_POINTS if has_stereo else 0

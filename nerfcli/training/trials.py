@@ -221,7 +221,7 @@ class Trials:
         # Small steps throughout: they learn more per sample, and a short training has few samples. It has few rows,
         # however long the training after it.
         rows = min(settings.chosen_log2_rows, FEWEST_LOG2_ROWS)
-        settings = replace(settings, samples_per_step=settings.first_samples_per_step, log2_rows=rows)
+        settings = replace(settings, samples_per_step=settings.samples[0], log2_rows=rows)
         self._inputs = replace(inputs, pool=self._pool, settings=settings, points=points if points.sets else None)
 
     def begin(self, components: Components, budget: Budget, *, fewest: int = 0) -> TrialStart | None:

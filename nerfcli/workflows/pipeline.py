@@ -16,7 +16,7 @@ from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.render.files.file_facts import RENDERS as DESCRIPTION
 from nerfcli.render.job import OUTPUTS, RenderSettings, VideoSettings
 from nerfcli.training.runs.run import Run
-from nerfcli.training.runs.settings import TrainSettings, sizes_for
+from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.workflows.evaluate import Evaluation, evaluate_run, evaluate_splats
 from nerfcli.workflows.export import default_target, export_run
 from nerfcli.workflows.poses import estimate_poses, without_suffix
@@ -84,7 +84,7 @@ def run_pipeline(
     Raises:
         UserError: as the functions of the stages do. After a KeyboardInterrupt, the same call continues.
     """
-    settings, again = training or _usual_training(resources), output.overwrite
+    settings, again = training or TrainSettings(model="auto"), output.overwrite
     settings = replace(settings, threads=resources.cores, device=resources.torch_device)
     scene_output = Output(None if output.path is None else Path(output.path) / "scene", again)
     capture = _capture_of(Path(photos), scene_output, reporter)
@@ -206,10 +206,6 @@ def _refuse_unused(photos: Path, poses: PoseSettings, *, frames: int | None, int
             "remove them; for new poses, give the folder of its photos",
             exit_code=2,
         )
-
-
-def _usual_training(resources: Resources) -> TrainSettings:
-    return TrainSettings(budget_seconds=120.0, model="auto", **sizes_for(resources.torch_device))
 
 
 def _capture_of(photos: Path, output: Output, reporter: Reporter) -> Path | None:

@@ -18,8 +18,8 @@ from nerfcli.training.runs.components import Components
 DOWNSCALES = (1, 2, 4, 8)
 # `--downscale auto` takes the largest pictures whose longer side is at most this many pixels.
 AUTO_LONGER_SIDE_PX = 800
-# Sizes of a training on a GPU, which small steps do not keep busy, and which has room for large tables.
-GPU_SIZES: dict[str, Any] = {"first_samples_per_step": 2**16, "samples_per_step": 2**18, "log2_rows": 19}
+# Target numbers of samples of the first step and at most. Small steps do not keep a GPU busy.
+CPU_SAMPLES, GPU_SAMPLES = (2**13, 2**16), (2**16, 2**18)
 # Number of steps in which the samples per step double. Small steps learn more per sample at first, so short trainings
 # have many of them; later, large steps are better and cost less per sample.
 DOUBLING_STEPS = 600
@@ -29,6 +29,8 @@ SAMPLES_PER_SECOND = 1e6
 # photos. The number of rows doubles at each of these numbers of samples. With 2^19 rows, the file of a field has 68 MB
 # and a step is an eighth slower than with 2^18.
 FEWEST_LOG2_ROWS, DOUBLE_ROWS_FROM = 16, (37e6, 74e6, 400e6)
+# A GPU has room for large tables.
+GPU_LOG2_ROWS = 19
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,8 @@ class TrainSettings:
         seed: seed of all random numbers.
         device: a torch device name.
         first_samples_per_step, samples_per_step: target number of field samples of a step, at the start and at most;
-            determines the number of rays. Small steps learn more per sample, large ones cost less per sample.
+            determines the number of rays. Small steps learn more per sample, large ones cost less per sample. None for
+            the usual ones of the device, see `samples`.
         learning_rate, final_learning_rate: learning rate of Adam at the start and at the end of the budget.
         warmup_steps: steps over which the learning rate rises from 0.
         log2_rows: size of a hash grid, see `HashFieldSettings`; None for automatic, see `chosen_log2_rows`.
@@ -67,8 +70,8 @@ class TrainSettings:
     seed: int = 0
     device: str = "cpu"
     threads: int = 1
-    first_samples_per_step: int = 2**13
-    samples_per_step: int = 2**16
+    first_samples_per_step: int | None = None
+    samples_per_step: int | None = None
     learning_rate: float = 1e-2
     final_learning_rate: float = 1e-3
     warmup_steps: int = 50
@@ -102,20 +105,32 @@ class TrainSettings:
         if self.contraction not in (None, *CONTRACTIONS):
             raise UserError(f"unknown contraction {self.contraction!r}", f"choose auto, {', '.join(CONTRACTIONS)}")
 
+    @property
+    def samples(self) -> tuple[int, int]:
+        """Target numbers of samples of the first step and at most: as given, or the usual ones of the device."""
+        first, most = GPU_SAMPLES if self.on_gpu else CPU_SAMPLES
+        most = self.samples_per_step or most
+        return min(self.first_samples_per_step or first, most), most
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether the device is a GPU."""
+        return self.device.startswith("cuda")
+
     def samples_at(self, step: float) -> float:
         """Return the target number of samples of a step; the first is step 0."""
-        growth = 2.0 ** min(step / DOUBLING_STEPS, 16)  # finite for any step
-        return min(self.samples_per_step, growth * self.first_samples_per_step)
+        first, most = self.samples
+        return min(most, 2.0 ** min(step / DOUBLING_STEPS, 16) * first)  # finite for any step
 
     @property
     def expected_samples(self) -> float:
         """Approximate number of samples of the whole training, the lesser of those by steps and by time and threads."""
         by_steps, by_time = math.inf, math.inf
+        first, most = self.samples
         if self.steps is not None:
-            growth = max(1.0, self.samples_per_step / self.first_samples_per_step)
-            rising = min(self.steps, DOUBLING_STEPS * math.log2(growth))
+            rising = min(self.steps, DOUBLING_STEPS * math.log2(most / first))
             rise = DOUBLING_STEPS / math.log(2) * (self.samples_at(rising) - self.samples_at(0))
-            by_steps = rise + (self.steps - rising) * self.samples_per_step
+            by_steps = rise + (self.steps - rising) * most
         if self.budget_seconds is not None:
             by_time = SAMPLES_PER_SECOND * self.threads * self.budget_seconds
         return min(by_steps, by_time)
@@ -123,18 +138,21 @@ class TrainSettings:
     @property
     def expected_steps(self) -> float:
         """Number of steps with about `expected_samples`."""
+        first, most = self.samples
         doubling = DOUBLING_STEPS / math.log(2.0)
-        rising = DOUBLING_STEPS * math.log2(max(1.0, self.samples_per_step / self.first_samples_per_step))
+        rising = DOUBLING_STEPS * math.log2(most / first)
         beyond = self.expected_samples - doubling * (self.samples_at(rising) - self.samples_at(0))
         if beyond >= 0.0:
-            return rising + beyond / self.samples_per_step
+            return rising + beyond / most
         return doubling * math.log1p(self.expected_samples / (doubling * self.samples_at(0)))
 
     @property
     def chosen_log2_rows(self) -> int:
-        """Binary logarithm of the rows of each table: as given, or chosen by the length of the training."""
+        """Binary logarithm of the rows of each table: as given, or chosen by the device and the training's length."""
         if self.log2_rows is not None:
             return self.log2_rows
+        if self.on_gpu:
+            return GPU_LOG2_ROWS
         return FEWEST_LOG2_ROWS + bisect(DOUBLE_ROWS_FROM, self.expected_samples)
 
     def to_json(self) -> dict[str, Any]:
@@ -146,11 +164,6 @@ class TrainSettings:
         components, fixed = Components(**content["components"]), tuple(content["fixed"])
         entries: dict[str, Any] = {**content, "components": components, "fixed": fixed}
         return cls(**entries)
-
-
-def sizes_for(device: str) -> dict[str, Any]:
-    """Return the settings for a device that differ from the defaults of `TrainSettings`."""
-    return GPU_SIZES if device.startswith("cuda") else {}
 
 
 def automatic_downscale(cameras: Sequence[Camera]) -> int:
