@@ -111,12 +111,18 @@ def test_a_refused_training_leaves_the_run_that_it_would_replace(capture, finish
 
 def test_resuming_what_has_used_its_budget_changes_nothing(capture, tmp_path):
     """Regression: photos were read and matched again only to find that no step was left."""
-    train = ("train", capture, "--steps", "1", "--downscale", "8", "--log2-rows", "10", "-o", tmp_path / "run")
-    assert nerfcli(*train).exit_code == 0
-    before = {path: path.read_bytes() for path in (tmp_path / "run").iterdir() if path.is_file()}
-    result = nerfcli(*train, "--resume")
-    assert result.exit_code == 0, result.stderr
-    assert result.stderr.splitlines()[1:2] == [
-        f"{tmp_path / 'run'} is kept: its training has used this budget; give a larger --budget or --steps"
-    ]
-    assert {path: path.read_bytes() for path in (tmp_path / "run").iterdir() if path.is_file()} == before
+    run = tmp_path / "run"
+    train = ("train", capture, "--steps", "2", "-o", run)
+    options = ("--downscale", "8", "--log2-rows", "10", "--seed", "3", "--with", "antialias")
+    assert nerfcli(*train, *options).exit_code == 0
+    before = listing(run)
+    for again in ((*train, *options), train, ("train", capture, "--steps", "1", "-o", run)):
+        result = nerfcli(*again, "--resume")
+        assert result.exit_code == 0, result.stderr
+        assert result.stderr.splitlines()[1:2] == [
+            f"{run} is kept: its training has used this budget; give a larger --budget or --steps"
+        ]
+    refused = nerfcli(*train, "--seed", "4", "--resume")
+    assert refused.exit_code == BAD_INPUT
+    assert error_of(refused)[0].endswith(f"{run} was trained with seed=3, not seed=4")
+    assert listing(run) == before

@@ -44,7 +44,7 @@ from nerfcli.training.loop import Progress
 from nerfcli.training.pool import PixelBatch, PixelPool
 from nerfcli.training.runs.components import Components, choose
 from nerfcli.training.runs.files import LogEntry, append_log, read_log
-from nerfcli.training.runs.run import Run, read_config
+from nerfcli.training.runs.run import Run, continued, read_config
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 
 # A step of a few rays is enough where bits are compared, not pictures.
@@ -206,8 +206,15 @@ def test_fields_of_other_kinds_train_and_resume_bit_for_bit(kind, views, tmp_pat
     assert [progress.loss for progress in second] == [progress.loss for progress in straight[5:]]
     assert weights(tmp_path / "parts") == weights(tmp_path / "straight")
     assert load_model(tmp_path / "parts" / "field.safetensors", "cpu").field.settings.kind == kind
-    with pytest.raises(UserError, match="was trained with another field"):
-        fit(views, tmp_path / "parts", replace(settings, field="hash"), resume=True)
+
+
+def test_photos_of_another_size_leave_the_field_of_a_training_as_it_is(views, tmp_path):
+    """By itself, a dense grid would have fewer vertices for smaller photos."""
+    settings = replace(FEW, steps=1, field="voxels", downscale=4)
+    fit(views, tmp_path / "run", settings)
+    before = load_model(tmp_path / "run" / "field.safetensors", "cpu").field.settings
+    assert len(fit(views, tmp_path / "run", replace(settings, steps=2, downscale=8), resume=True)) == 1
+    assert load_model(tmp_path / "run" / "field.safetensors", "cpu").field.settings == before
 
 
 @pytest.mark.parametrize("steps", [1, 600, 1800, 1801, 9000])
@@ -240,7 +247,9 @@ def test_a_training_that_goes_on_to_a_larger_total_keeps_its_rows(views, tmp_pat
     fit(views, tmp_path / "run", replace(CHOSEN_ROWS, steps=3), resume=True)
     assert load_model(tmp_path / "run" / "field.safetensors", "cpu").field.settings.to_json()["log2_rows"] == 16
     assert read_config(tmp_path / "run").settings.log2_rows == 16
-    with pytest.raises(UserError, match="was trained with another field"):
+    on_gpu = replace(CHOSEN_ROWS, device="cuda")
+    assert continued(tmp_path, on_gpu, before=read_config(tmp_path / "run")).log2_rows == 16
+    with pytest.raises(UserError, match="was trained with log2_rows=16, not log2_rows=17"):
         fit(views, tmp_path / "run", replace(CHOSEN_ROWS, steps=4, log2_rows=17), resume=True)
 
 
@@ -278,10 +287,12 @@ def test_resume_goes_on_to_a_larger_total(views, tmp_path):
     assert fit(views, tmp_path / "run", replace(FEW, steps=5), resume=True) == []
 
 
-def test_a_resumed_training_keeps_its_components_seed_and_size_of_photos(views, tmp_path):
+@pytest.mark.parametrize("size", [{"log2_rows": None, "field_memory_bytes": 200_000}, {"field": "voxels"}])
+def test_a_resumed_training_keeps_its_settings(size, views, tmp_path):
     """They need not be given again; others than before are refused, or would be in the description alone."""
     chosen = {"components": Components(distortion=0.01, exposure="learned"), "fixed": ("distortion", "exposure")}
-    settings = replace(FEW, steps=6, downscale=4, seed=3, **chosen)
+    settings = replace(FEW, steps=6, downscale=4, seed=3, **chosen, **size)
+    bare = TrainSettings(budget_seconds=None, steps=6, threads=2)
     fit(views, tmp_path / "straight", settings)
     with pytest.raises(KeyboardInterrupt):
         fit(views, tmp_path / "parts", settings, stop_at=3)
@@ -290,7 +301,12 @@ def test_a_resumed_training_keeps_its_components_seed_and_size_of_photos(views, 
         changed = replace(settings, components=others, fixed=(wanted.partition("=")[0],))
         with pytest.raises(UserError, match=rf"was trained with .*, not {wanted}"):
             fit(views, tmp_path / "parts", changed, resume=True)
-    fit(views, tmp_path / "parts", replace(FEW, steps=6), resume=True)
+    changes = (replace(bare, seed=5), replace(bare, log2_rows=11), replace(bare, field="mlp"))
+    changes += (replace(bare, field_memory_bytes=9), replace(bare, contraction="l2"))
+    for changed in (*changes, replace(bare, components=Components(exposure="exif"))):
+        with pytest.raises(UserError, match="was trained with"):
+            fit(views, tmp_path / "parts", changed, resume=True)
+    fit(views, tmp_path / "parts", bare, resume=True)
     assert weights(tmp_path / "parts") == weights(tmp_path / "straight")
     assert read_config(tmp_path / "parts") == read_config(tmp_path / "straight")
 

@@ -25,7 +25,6 @@ from nerfcli.field.background import colours_behind
 from nerfcli.field.checkpoint import load_tensors, refuse_non_finite, save_tensors
 from nerfcli.field.exposure import changed_in_front, exposed
 from nerfcli.field.hash_field import HashField
-from nerfcli.field.kinds import settings_from_json
 from nerfcli.photos.colours import psnr_of
 from nerfcli.photos.exif import log_exposures
 from nerfcli.photos.held_out_exposure import (
@@ -45,12 +44,9 @@ from nerfcli.training.pool import PixelPool, load_album
 from nerfcli.training.preparation import EarlierDecisions
 from nerfcli.training.runs.files import FIELD, STATE, add_to_log
 from nerfcli.training.runs.run import Run, read_config
-from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.sentinel import that_must_be_finite
 
 STATE_FORMAT = "nerfcli training 2"
-# Advice where a training cannot be resumed as requested.
-ANEW = "train into a new folder with -o, or again with --overwrite"
 # Photos without alpha fill the frame; behind the field is black, and little of it shows through.
 OPAQUE_BACKGROUND = (0.0, 0.0, 0.0)
 ALPHA_BACKGROUND = (1.0, 1.0, 1.0)
@@ -183,35 +179,24 @@ class Checkpoints:
         self.write_cameras()
 
 
-def read_checkpoint(
-    run: Path, settings: TrainSettings
-) -> tuple[tuple[dict[str, Tensor], dict[str, Any]], EarlierDecisions]:
+def read_checkpoint(run: Path, device: str) -> tuple[tuple[dict[str, Tensor], dict[str, Any]], EarlierDecisions]:
     """Return the last checkpoint of a run, for `restore`, and the decisions made before it.
 
     Raises:
-        UserError: there is none, another version wrote it, or it has another contraction or component than requested.
+        UserError: there is none, or another version wrote it.
     """
-    tensors, description = load_tensors(run / STATE, settings.device)
+    tensors, description = load_tensors(run / STATE, device)
     if description.get("format") != STATE_FORMAT:
         raise UserError(f"{run / STATE} was written by another version of nerfcli", "train again with --overwrite")
-    extent, config = Extent.from_json(description["extent"]), read_config(run)
-    if settings.contraction not in (None, extent.contraction):
-        raise UserError(f"{run} was trained with --contraction {extent.contraction}, not {settings.contraction}", ANEW)
-    for name in settings.fixed:
-        had, wanted = (str(getattr(one, name)).lower() for one in (config.components, settings.components))
-        if had != wanted:
-            raise UserError(f"{run} was trained with {name}={had}, not {name}={wanted}", ANEW)
-    return (tensors, description), EarlierDecisions(extent, config)
+    return (tensors, description), EarlierDecisions(Extent.from_json(description["extent"]), read_config(run))
 
 
 def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> Totals:
-    """Restore `fitting` from the run's last checkpoint.
+    """Restore `fitting`, whose field has the checkpoint's size, from the run's last checkpoint.
 
     Raises:
-        UserError: the checkpoint has another field, or numbers that are not finite.
+        UserError: it has numbers that are not finite.
     """
-    if settings_from_json(description["field"]) != fitting.field.settings:
-        raise UserError(f"{run} was trained with another field ({description['field']})", ANEW)
     refuse_non_finite(that_must_be_finite(tensors), run / STATE)
     fitting.restore(tensors, description)
     return Totals(**description["totals"])

@@ -12,7 +12,7 @@ from nerfcli import distributed, kernels
 from nerfcli.atomic import cannot_write
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import LOST_RANK, UserError
-from nerfcli.field.kinds import field_bytes
+from nerfcli.field.kinds import field_bytes, settings_from_json
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.machine import begin_recent_peak, peak_resident_bytes, use_threads
 from nerfcli.photos.masks import write_masks
@@ -27,7 +27,7 @@ from nerfcli.training.checkpoints import (
 from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.files import FIELD, LOG, METRICS, STATE, LogEntry, append_log, cut_log
-from nerfcli.training.runs.run import RunConfig, write_config
+from nerfcli.training.runs.run import RunConfig, continued, write_config
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import WAYPOINTS, Budget
 from nerfcli.training.sentinel import FAILURES, Sentinel
@@ -102,26 +102,29 @@ def train(
         scene: photos, cameras and split.
         run: the folder to write; must not hold a run unless `resume`.
         settings: budget, resolution, seed, device.
-        resume: go on from the run's last checkpoint to the budget or step count of `settings`, which count from 0.
+        resume: go on from the run's last checkpoint to the budget or step count of `settings`, which count from 0, see
+            `continued`.
         memory_bytes: limit of resident memory; photos that do not fit are kept in files, and the result is the same. On
             a GPU, limit of its memory, into which everything has to fit.
         on_progress: called after every step.
 
     Raises:
-        UserError: too little memory, unreadable photos, numbers that became non-finite, nothing to resume, a folder
-            that cannot be written, or, after a checkpoint has been written, another process that has ended.
+        UserError: too little memory, unreadable photos, numbers that became non-finite, nothing to resume or other
+            settings than `continued` allows, a folder that cannot be written, or, after a checkpoint has been written,
+            another process that has ended.
         KeyboardInterrupt: passed on after a checkpoint has been written.
     """
     use_threads(settings.threads)
     begin_recent_peak()
     kernels.prepare(notify, settings.device)
-    saved, begun = distributed.from_first(lambda: read_checkpoint(run, settings) if resume else (None, None))
+    device = settings.device
+    saved, begun = distributed.from_first(lambda: read_checkpoint(run, device) if resume else (None, None))
     if begun is not None:
-        settings = begun.continued(settings)
+        settings = continued(run, settings, before=begun.config)
     with_all_threads = replace(settings, threads=sum(distributed.gathered(settings.threads)))
     settings = replace(settings, log2_rows=with_all_threads.chosen_log2_rows)
     inputs = prepare(scene, settings, run=run, memory_bytes=memory_bytes, begun=begun, notify=notify)
-    fitting = Fitting(inputs)
+    fitting = Fitting(inputs, size=None if saved is None else settings_from_json(saved[1]["field"]))
     notify(f"field: {fitting.field.settings.size_text}; {field_bytes(fitting.field) / 1e6:.2f} MB")
     if saved is not None:
         totals = restore(fitting, run, *saved)

@@ -40,22 +40,6 @@ class EarlierDecisions:
     extent: Extent
     config: RunConfig
 
-    def continued(self, settings: TrainSettings) -> TrainSettings:
-        """Return settings with what a training keeps: its seed, components and, unless given, rows and size of photos.
-
-        A larger budget alone would choose more rows.
-        """
-        before = self.config.settings
-        return replace(
-            settings,
-            seed=before.seed,
-            components=before.components,
-            model=before.model,
-            fixed=before.fixed,
-            log2_rows=settings.log2_rows or before.log2_rows,
-            downscale=settings.downscale or before.downscale,
-        )
-
 
 def prepare(
     scene: Capture,

@@ -29,7 +29,7 @@ from nerfcli.training import loop
 from nerfcli.training.loop import OCCLUDERS
 from nerfcli.training.runs.components import choose
 from nerfcli.training.runs.files import CONFIG, LOCK, STATE
-from nerfcli.training.runs.run import Run, split_hash
+from nerfcli.training.runs.run import Run, continued, split_hash
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.training.schedule import WAYPOINTS, Schedule, StepPlan
 from nerfcli.training.storage import InFiles, needs_of, planned_field, storage_for
@@ -174,13 +174,8 @@ def _goes_on(run: Run, scene: Capture, settings: TrainSettings) -> bool:
     """Return whether a training of this scene with these settings but for its budget is there to go on with."""
     if not run.is_trained or (run.is_complete(settings) and run.is_trained_from(scene, settings)):
         return False
-    return run.is_trained_from(scene, _with_limits_of(settings, run))
-
-
-def _with_limits_of(settings: TrainSettings, run: Run) -> TrainSettings:
-    """Return the settings with the budget and the steps of a run."""
     before = run.config.settings
-    return replace(settings, budget_seconds=before.budget_seconds, steps=before.steps)
+    return run.is_trained_from(scene, replace(settings, budget_seconds=before.budget_seconds, steps=before.steps))
 
 
 def _describe(folder: Path, scene: Capture, reporter: Reporter) -> None:
@@ -214,8 +209,8 @@ def _keeps(task: _Task) -> bool:
         )
     if task.resume and run.config.scene_fingerprint != fingerprint(scene):
         raise UserError(f"{path} was trained on a different scene than {scene.root}", "choose another folder with -o")
-    if task.resume and run.is_complete(settings):  # decided before stereo matching is repeated needlessly
-        return run.is_trained_from(scene, _with_limits_of(settings, run))
+    if task.resume and run.is_complete(continued(path, settings, before=run.config)):
+        return True  # before photos are read and matched needlessly
     if run.is_trained and not task.resume and not task.overwrite:
         if run.is_trained_from(scene, settings) and run.is_complete(settings):
             return True

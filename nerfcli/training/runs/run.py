@@ -3,7 +3,7 @@
 import hashlib
 import platform
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -18,7 +18,7 @@ from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.errors import UserError, in_shell
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.render.model import Model, load_model
-from nerfcli.training.runs.components import Components, Decision, Selection
+from nerfcli.training.runs.components import Components, Decision, Selection, differences
 from nerfcli.training.runs.files import CONFIG, FIELD, METRICS, STATE, LogEntry, TrainingSummary, read_log
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.version import __version__
@@ -163,6 +163,36 @@ def no_run(path: Path) -> UserError:
 def split_hash(test_names: Iterable[str]) -> str:
     """Return the SHA-256 of the sorted names of the held-out photos: the same split has the same hash."""
     return hashlib.sha256("\n".join(sorted(test_names)).encode()).hexdigest()
+
+
+# Settings that a training keeps for good, besides its components, see `continued`.
+_KEPT = ("contraction", "seed", "log2_rows", "field", "field_memory_bytes")
+
+
+def continued(run: Path, settings: TrainSettings, *, before: RunConfig) -> TrainSettings:
+    """Return the settings with which a training goes on: its own, except for those that are given.
+
+    Limits, device and threads are always those given; any other setting with its default counts as not given.
+
+    Args:
+        run: the folder of the training.
+        before: its configuration.
+
+    Raises:
+        UserError: components, or settings that it keeps, are given and differ.
+    """
+    own, usual = before.settings, TrainSettings()
+    given = {name: value for name, value in vars(settings).items() if value != getattr(usual, name)}
+    named = settings.fixed if settings.model == "auto" else (*settings.fixed, *differences(settings.components))
+    had = vars(own) | vars(before.components)
+    wanted = {name: given[name] for name in _KEPT if name in given}
+    for name, value in (wanted | {name: getattr(settings.components, name) for name in named}).items():
+        if had[name] != value:
+            made, asked = (f"{name}={str(one).lower()}" for one in (had[name], value))
+            hint = "train into a new folder with -o, or again with --overwrite"
+            raise UserError(f"{run} was trained with {made}, not {asked}", hint)
+    given |= {name: getattr(settings, name) for name in ("budget_seconds", "steps", "device", "threads")}
+    return replace(own, **given | {name: getattr(own, name) for name in ("components", "model", "fixed")})
 
 
 class Run:
