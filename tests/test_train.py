@@ -32,7 +32,7 @@ from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.evaluate.photos import HeldOutPhoto, over_white
 from nerfcli.evaluate.protocol import evaluate_model
 from nerfcli.field import hash_field
-from nerfcli.field.checkpoint import load_tensors
+from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.machine import peak_resident_bytes
 from nerfcli.photos.images import read_image, write_png
 from nerfcli.photos.loading import load_photos
@@ -326,6 +326,15 @@ def test_what_has_learned_goes_on_learning_in_a_larger_budget(views, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         fit(views, tmp_path / "run", replace(FEW, steps=400), resume=True, stop_at=4)
     assert not torch.equal(finest(tmp_path / "run"), learned)
+
+
+def test_a_training_goes_on_from_the_checkpoint_of_another_type_of_device(views, tmp_path):
+    """The state of a GPU's random numbers has 16 bytes, and means nothing to a CPU."""
+    fit(views, tmp_path / "run", replace(FEW, steps=3))
+    tensors, description = load_tensors(tmp_path / "run" / "state.safetensors", "cpu")
+    tensors["generator"] = torch.zeros(16, dtype=torch.uint8)
+    save_tensors(tmp_path / "run" / "state.safetensors", tensors, description)
+    assert [progress.step for progress in fit(views, tmp_path / "run", replace(FEW, steps=4), resume=True)] == [4]
 
 
 @pytest.mark.parametrize("last", ["field.safetensors", "state.safetensors"])

@@ -274,7 +274,9 @@ class Fitting:
         self.field.load_state_dict(
             {name.removeprefix("field."): value for name, value in tensors.items() if name.startswith("field.")}
         )
-        self.generator.set_state(tensors["generator"].cpu())
+        random = tensors["generator"].cpu()
+        if random.shape == self.generator.get_state().shape:  # else the checkpoint is from another type of device
+            self.generator.set_state(random)
         self.cells.restore(tensors)
         self.optimiser.restore(tensors)
         self.appearance.load_state_dict({name: tensors[f"parts.{name}"] for name in self.appearance.state_dict()})
