@@ -100,6 +100,7 @@ def empty_space_of(along: March, edges: np.ndarray) -> EmptySpace:
 
 
 def _chunks_of(edges: np.ndarray) -> np.ndarray:
+    """Return `EmptySpace.chunks` for the edges of a `Walk`, which are padded."""
     chunks = -(-len(edges) // CHUNK)
     first = np.minimum(np.arange(-(-chunks // WINDOW) * WINDOW) * CHUNK, len(edges) - 1)
     begin, end = edges[first], edges[np.minimum(first + CHUNK + 1, len(edges) - 1)]
