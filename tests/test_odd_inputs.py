@@ -455,6 +455,10 @@ def test_a_frame_has_its_own_focal_length_in_either_key(tmp_path):
     capture = read_again(tmp_path, content)
     np.testing.assert_allclose([frame.camera.focal_lengths for frame in capture.frames], 140.0, rtol=1e-12)
     assert capture.notes == ()
+    for frame in content["frames"]:
+        del frame["camera_angle_y"]
+    capture = read_again(tmp_path, content)
+    np.testing.assert_allclose([frame.camera.focal_lengths for frame in capture.frames], 140.0, rtol=1e-12)
 
 
 def test_two_keys_that_give_different_focal_lengths_are_said(tmp_path):
