@@ -487,6 +487,9 @@ def test_empty_texts_of_a_template_are_no_numbers_and_no_masks(tmp_path):
     capture = read_again(tmp_path, content)
     assert {frame.camera for frame in capture.frames} == {PINHOLE}
     assert capture.notes == ()
+    for frame in content["frames"]:
+        frame |= {"fl_x": "", "cx": "", "cy": None}
+    assert {frame.camera for frame in read_again(tmp_path, content).frames} == {PINHOLE}
 
 
 @pytest.mark.parametrize(

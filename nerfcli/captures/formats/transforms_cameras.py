@@ -98,11 +98,14 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
 
 
 def merged(content: dict[str, Any], record: dict[str, Any]) -> dict[str, Any]:
-    """Return the keys of a frame over those of the whole file, whose focal lengths count only where it has none."""
+    """Return the keys of a frame over those of the whole file, whose focal lengths count only where it has none.
+
+    Null and empty texts of a frame leave the value of the file.
+    """
     own = {key: value for key, value in record.items() if value not in (None, "")}
     focal = {key for keys in _SAME for key in keys}
     unused = focal if focal & own.keys() else set[str]()
-    return {key: value for key, value in content.items() if key not in unused} | record
+    return record | {key: value for key, value in content.items() if key not in unused} | own
 
 
 def contradictions(listed: Sequence[tuple[dict[str, Any], str, Size]]) -> tuple[str, ...]:
