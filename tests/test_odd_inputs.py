@@ -472,6 +472,9 @@ def test_two_keys_that_give_different_focal_lengths_are_said(tmp_path):
     assert capture.notes == (f"{what}: fl_x is used",)
     same["frames"][1] |= {"transform_matrix": np.full((4, 4), np.nan).tolist(), "fl_x": np.nan, "camera_angle_y": None}
     assert len(read_again(tmp_path, same).frames) == COUNT - 1
+    assert read_again(tmp_path, written(tmp_path, camera_angle_x="wide", camera_angle_y=np.nan)).notes == ()
+    fisheye = written(tmp_path, camera_model="OPENCV_FISHEYE", camera_angle_x=SIZE[0] / fx)  # of equal angles
+    assert read_again(tmp_path, fisheye).notes == ()
 
 
 @pytest.mark.parametrize("listed", ["C:\\out\\points.ply", "Points.PLY", "file:///out/points.ply"])

@@ -178,7 +178,7 @@ def listed_frames(
         depth = None if map_path is None else SensorDepth(map_path, MILLIMETRE)  # nerfstudio's default unit
         camera = cameras.setdefault(camera, camera)
         frames.append(Frame(names[index], camera, pose, places[index], masks[index], split=split, depth=depth))
-        used.append((record, where, own_size))
+        used.append((record, camera))
     notes = (*found.notes, *poses.notes(), *contradictions(used), *fits.notes(), *lost_masks, *lost_depths)
     return frames, missing, notes
 

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Size
 from nerfcli.captures.formats import fields, lenses
 from nerfcli.captures.formats.fields import malformed
 from nerfcli.captures.formats.lenses import Fits, Terms
@@ -108,19 +107,20 @@ def merged(content: dict[str, Any], record: dict[str, Any]) -> dict[str, Any]:
     return record | {key: value for key, value in content.items() if key not in unused} | own
 
 
-def contradictions(listed: Sequence[tuple[dict[str, Any], str, Size]]) -> tuple[str, ...]:
+def contradictions(listed: Sequence[tuple[dict[str, Any], Camera]]) -> tuple[str, ...]:
     """Return a line for each axis on which two keys give different focal lengths, for people.
 
     Args:
-        listed: the frames' keys, see `merged`, their places in the file, and the sizes of their pictures.
+        listed: the frames' keys, see `merged`, and their cameras.
     """
     notes = []
     for side, (key, other) in enumerate(_SAME):
         off = []
-        for record, where, size in listed:
-            focal, angle = number(record, key, where), number(record, other, where)
-            if focal is not None and angle is not None and 0 < angle < math.pi:
-                by_angle = size[side] / 2 / math.tan(angle / 2)
+        for record, camera in listed:
+            angle = record.get(other)  # not checked, as it is not used
+            has_both = record.get(key) not in (None, "") and isinstance(angle, float) and 0 < angle < math.pi
+            if has_both and projection(camera) == "perspective":
+                by_angle, focal = camera.size[side] / 2 / math.tan(angle / 2), camera.focal_lengths[side]
                 off += [(by_angle, focal)] if abs(by_angle - focal) > _SAME_FOCAL * focal else []
         if off:
             by_angle, focal = off[0]
