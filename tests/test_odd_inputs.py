@@ -500,6 +500,7 @@ def test_empty_texts_of_a_template_are_no_numbers_and_no_masks(tmp_path):
     [
         ({"fl_x": 0.78, "fl_y": 1.04, "cx": 0.5, "cy": 0.5}, "fl_x is 0.78"),
         ({"camera_model": "OPENCV", "k5": 0.1}, "k5 is 0.1 and k6 is 0"),
+        ({"camera_model": "OPENCV_FISHEYE", "k6": 0.1}, "k5 is 0 and k6 is 0.1"),
     ],
 )
 def test_intrinsics_without_a_meaning_are_refused(more, what, tmp_path):
@@ -514,6 +515,8 @@ def test_full_opencv_is_the_model_of_colmap_with_a_divisor(tmp_path):
     assert {frame.camera for frame in capture.frames} == {
         Camera("FULL_OPENCV", *SIZE, (*PINHOLE.params, *terms.values()))
     }
+    plain = read_again(tmp_path, written(tmp_path, camera_model="FULL_OPENCV", k1=0.0, k4=0.0))
+    assert {frame.camera for frame in plain.frames} == {PINHOLE}  # which more programs read
 
 
 # Models

@@ -76,16 +76,16 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
     cx, cy = number(record, "cx", where), number(record, "cy", where)
     head = (fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
     k1, k2, k3, k4, k5, k6, p1, p2 = (number(record, key, where) or 0.0 for key in _INTRINSICS)
+    if (k5 or k6) and model != _RATIONAL:
+        raise malformed(where, f"k5 is {k5:g} and k6 is {k6:g}", f"only camera_model {_RATIONAL} has these terms")
     if model in _FISHEYE_MODELS or record.get("is_fisheye") is True:
         radial, tangential = (k1, k2, k3, k4), (p1, p2)
         return lenses.fisheye_camera(size, head[:2], head[2:], radial=radial, tangential=tangential, where=where)
     if model not in _PERSPECTIVE_MODELS:
         supported = ", ".join(str(name) for name in (*_PERSPECTIVE_MODELS[1:], *_FISHEYE_MODELS, "EQUIRECTANGULAR"))
         raise malformed(where, f"camera_model {model!r:.80} is not supported", f"expected one of {supported}")
-    if model == _RATIONAL:
+    if model == _RATIONAL and (k4 or k5 or k6):
         return checked_camera(model, width, height, (*head, k1, k2, p1, p2, k3, k4, k5, k6), where=where)
-    if k5 or k6:
-        raise malformed(where, f"k5 is {k5:g} and k6 is {k6:g}", f"only camera_model {_RATIONAL} has these terms")
     if k4:
         return fits.brown(size, head[:2], head[2:], terms=Terms((k1, k2, k3, k4), (p1, p2)), where=where)
     if k3:
