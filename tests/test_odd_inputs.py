@@ -190,6 +190,11 @@ def test_a_photo_that_was_moved_to_a_subfolder_is_not_brought_back(tmp_path):
     assert levels(find(tmp_path, ["a.png", "b.png"]).paths) == [0, None]
 
 
+def test_the_mask_of_a_photo_that_is_missing_is_not_taken_for_it(tmp_path):
+    photos(tmp_path, ["images/a.jpg", "masks/a.jpg.png", "masks/b.jpg.png"])
+    assert levels(find(tmp_path, ["a.jpg", "b.jpg"], given=tmp_path).paths) == [0, None]
+
+
 @pytest.mark.parametrize("write", [colmap, transforms])
 def test_a_conversion_names_missing_photos_and_fails_without_any(write, tmp_path):
     photos(tmp_path / "images", numbered("{}.png")[2:])

@@ -53,8 +53,9 @@ class Name:
         is_absolute = pure.is_absolute() or _DRIVE.match(listed) is not None
         parts = [part for part in pure.parts[:-1] if part.strip("/") not in ("", "..") and not _DRIVE.fullmatch(part)]
         whole, stem = _plain(pure.name), _plain(_SUFFIX.sub("", pure.name))
-        # Converters also append a suffix: IMG_1.HEIC becomes IMG_1.HEIC.jpg.
-        stems = (stem, whole) if pure.suffix.lower() in IMAGE_SUFFIXES else (whole, stem)
+        # Converters also append a suffix: IMG_1.HEIC becomes IMG_1.HEIC.jpg. But IMG_1.jpg.png is a mask.
+        suffix = pure.suffix.lower()
+        stems = (stem, whole) if suffix in HEIC_SUFFIXES else (stem,) if suffix in IMAGE_SUFFIXES else (whole, stem)
         return cls(listed, str(pure), tuple(map(_plain, parts)), stems, is_absolute)
 
     @property
