@@ -753,6 +753,15 @@ def test_depth_maps_under_other_names_and_those_that_are_missing(tmp_path):
     assert capture.notes == ("1 depth map named in transforms.json left out, not found: depth/3.png",)
 
 
+def test_a_preview_is_not_taken_for_the_depth_map(tmp_path):
+    content = written(tmp_path)
+    photos(tmp_path, ["depth/0.png"])
+    content["frames"][0]["depth_file_path"] = "depth/0.npy"
+    capture = read_again(tmp_path, content)
+    assert capture.frames[0].depth is None
+    assert capture.notes == ("1 depth map named in transforms.json left out, not found: depth/0.npy",)
+
+
 def test_equal_labels_of_metashape_are_told_apart_by_their_groups(tmp_path):
     put("metashape", tmp_path)
     path = tmp_path / "cameras.xml"

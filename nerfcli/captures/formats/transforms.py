@@ -24,7 +24,7 @@ from nerfcli.captures.formats.format import Format, UserInputs, find_json
 from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos, seen_from
-from nerfcli.captures.formats.photo_search import plain_name
+from nerfcli.captures.formats.photo_search import Name, plain_name
 from nerfcli.captures.formats.ply import read_points, write_points
 from nerfcli.captures.formats.record3d import find_record3d
 from nerfcli.captures.formats.run_cameras import find_run
@@ -195,7 +195,7 @@ def _beside(
     """Return the mask or depth map that each frame names under a key, None if it is not on disk, and what is lost.
 
     Args:
-        noun: what it is.
+        noun: what it is. A depth map has the suffix that is named: another file is a preview of it.
         places: the folder that paths are relative to, and the usual name of the folder of these files in it.
         photos: none of which it can be.
     """
@@ -205,8 +205,12 @@ def _beside(
             raise malformed(where, f"{key} is {text!r:.80}", f"expected the path of a {noun} as text")
     named = {text for text in texts if text.strip()}
     found = find_photos(sorted(named), (places[0],), folders=(places[1],), others=())
-    paths = {name: file for name, file in zip(found.listed, found.paths, strict=True) if file not in photos}
-    lost = sorted(name for name in named if paths.get(name) is None)
+    paths = {
+        name: file
+        for name, file in zip(found.listed, found.paths, strict=True)
+        if file is not None and file not in photos and (noun == "mask" or Name.of(name).suffix == file.suffix.lower())
+    }
+    lost = sorted(named - paths.keys())
     notes = (f"{several(len(lost), noun)} named in {path.name} left out, not found: {in_words(lost)}",)
     return [paths.get(text) for text in texts], notes if lost else ()
 
