@@ -219,8 +219,8 @@ def test_a_calibration_is_fitted_to_the_picture_on_disk(tmp_path):
         fit_to_picture(camera, pose, path=path, measured=(90, 90, 1))
     with pytest.raises(UserError, match="orientation 5 mirrors"):
         fit_to_picture(camera, pose, path=path, measured=(80, 100, 5))
-    with pytest.raises(UserError, match="spherical picture"):
-        turned(camera_of("EQUIRECTANGULAR"), pose, orientation=6)
+    with pytest.raises(UserError, match=r"a\.jpg: a spherical picture with EXIF orientation 6"):
+        fit_to_picture(camera_of("EQUIRECTANGULAR"), pose, path=path, measured=(80, 100, 6))
 
 
 def test_a_picture_contains_its_left_and_upper_edge_but_not_the_others():

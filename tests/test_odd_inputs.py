@@ -46,6 +46,14 @@ def photos(folder: Path, names: Sequence[str], *, size: tuple[int, int] = SIZE) 
         Image.new("L", size, 10 * index).save(folder / name)
 
 
+def with_orientation(path: Path, orientation: int) -> None:
+    """Write an EXIF orientation to a photo."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    with Image.open(path) as picture:
+        picture.save(path, exif=exif)
+
+
 def levels(found: Sequence[Path | None]) -> list[int | None]:
     """Return the numbers of the photos that were found."""
     return [None if path is None else round(float(np.asarray(Image.open(path)).mean()) / 10) for path in found]
@@ -218,10 +226,24 @@ def test_a_conversion_refuses_cameras_of_another_shape_than_their_photos(write, 
     assert refused.exit_code == BAD_INPUT
     assert "images/0.png: a picture of 480x640 pixels does not match a camera of 640x480" in error_of(refused)[0]
     assert nerfcli("convert", tmp_path, tmp_path / "out.txt", "--to", "tum", "--allow-loss").exit_code == 0
+    photos(tmp_path / "images", numbered("{}.png"))
     (tmp_path / "images/0.png").write_bytes(b"")
-    photos(tmp_path / "images", numbered("{}.png")[1:])
+    with_orientation(tmp_path / "images/1.png", 2)
     kept = nerfcli("convert", tmp_path, tmp_path / "out.json", "--to", "transforms", "--allow-loss")
     assert kept.exit_code == 0, kept.stderr
+
+
+def test_a_panorama_with_an_orientation_is_converted_as_stored_and_not_turned(tmp_path):
+    photos(tmp_path, numbered("images/{}.png"), size=(128, 64))
+    with_orientation(tmp_path / "images/1.png", 3)
+    sphere = {"camera_model": "EQUIRECTANGULAR", "w": 128, "h": 64}
+    content = transforms_record(numbered("images/{}.png"), **sphere)
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    stored = nerfcli("convert", tmp_path, tmp_path / "out", "--to", "colmap")
+    assert stored.exit_code == 0, stored.stderr
+    turned = nerfcli("convert", tmp_path, tmp_path / "scene", "--to", "nerfcli")
+    assert turned.exit_code == BAD_INPUT
+    assert "images/1.png: a spherical picture with EXIF orientation 3" in error_of(turned)[0]
 
 
 def test_a_folder_is_listed_once_for_all_names(tmp_path, monkeypatch):

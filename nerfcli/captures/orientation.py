@@ -57,7 +57,7 @@ def fit_to_picture(
     and may be for another size of the same picture.
 
     Raises:
-        UserError: neither aspect ratio fits (both sizes are named), or the EXIF orientation mirrors the picture.
+        UserError: neither aspect ratio fits (both sizes are named), or see `turn_to_upright`.
     """
     orientation, size = turn_to_upright(camera, measured, path=path)
     try:
@@ -74,7 +74,7 @@ def turn_to_upright(camera: Camera, measured: Measured, *, path: Path) -> tuple[
     sees it, before turning, and may differ from the camera's size if the picture was resized.
 
     Raises:
-        UserError: the EXIF orientation mirrors the picture.
+        UserError: the EXIF orientation mirrors the picture, or turns one of the whole sphere.
     """
     width, height, orientation = measured
     if orientation not in _TURNS:
@@ -85,6 +85,11 @@ def turn_to_upright(camera: Camera, measured: Measured, *, path: Path) -> tuple[
     stored = (height, width) if orientation >= 5 else (width, height)
     if stored != (width, height) and _shape_error(camera, stored) > _shape_error(camera, (width, height)):
         return 1, (width, height)
+    if orientation != 1 and camera.is_spherical:
+        raise UserError(
+            f"{path}: a spherical picture with EXIF orientation {orientation}",
+            "save the panorama upright without the tag",
+        )
     return orientation, stored
 
 
@@ -92,18 +97,11 @@ def turned(camera: Camera, world_from_cam: np.ndarray, *, orientation: int) -> t
     """Return the camera and pose of the upright picture, given those of the stored one.
 
     Args:
+        camera: of a perspective or fisheye lens, unless the orientation is 1.
         orientation: EXIF: 1, 3, 6 or 8.
-
-    Raises:
-        UserError: a spherical picture, which cannot be turned.
     """
     if orientation == 1:
         return camera, world_from_cam
-    if camera.is_spherical:
-        raise UserError(
-            f"a spherical picture with EXIF orientation {orientation}",
-            "save the panorama upright without the tag",
-        )
     turn = _TURNS[orientation]
     values, middle = camera.values, np.array(camera.size) / 2
     width, height = camera.size[::-1] if orientation in (6, 8) else camera.size
@@ -188,7 +186,7 @@ def in_pixels(capture: Capture, pixels: str) -> ReorientedCapture:
     Frames without a photo on disk are left as they are, and reported.
 
     Raises:
-        UserError: a photo cannot be read, is mirrored by its orientation, or has another shape than its camera.
+        UserError: a photo cannot be read or turned, or has another shape than its camera.
     """
     if capture.pixels == pixels:
         return ReorientedCapture(capture)
@@ -224,7 +222,7 @@ def upright(frame: Frame, measure: Measure) -> Frame:
 def other_sizes(capture: Capture) -> dict[tuple[Size, Size], int]:
     """Count the photos on disk whose intrinsics are for another size, as in `Capture.rescaled`.
 
-    At most 200 photos, spread over the capture, are measured; those that cannot be read or are mirrored are skipped.
+    At most 200 photos, spread over the capture, are measured; those that cannot be read or turned are skipped.
 
     Raises:
         UserError: a photo has another shape than its camera.
