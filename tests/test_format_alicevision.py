@@ -198,6 +198,7 @@ def test_files_are_recognised_by_their_suffix_or_their_keys(tmp_path):
         ({"version": ["1", "2"]}, "version: has 2 numbers"),
         ({"views": [content()["views"][0] | {"rigId": "3"}]}, r"views\[0\]: belongs to a camera rig"),
         ({"views": [content()["views"][0] | {"intrinsicId": "8"}]}, r"views\[0\]: intrinsicId is '8'"),
+        ({"views": [content()["views"][0] | {"poseId": []}]}, "lists no images with a pose"),
         ({"views": []}, "lists no images with a pose"),
         ({"intrinsics": [LENS | {"type": "equidistant"}]}, "a lens of type 'equidistant' is not supported"),
         ({"intrinsics": [LENS | {"sensorWidth": "0"}]}, "sensorWidth is 0"),

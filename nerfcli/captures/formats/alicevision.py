@@ -74,8 +74,8 @@ def parse_alicevision(path: Path, given: UserInputs = UserInputs()) -> Capture:
     for (view, where), place in zip(views, paths, strict=True):
         if "rigId" in view:
             raise malformed(where, "belongs to a camera rig", "rigs are not supported; convert to COLMAP in Meshroom")
-        pose, camera = view.get("poseId"), view.get("intrinsicId")
-        world_from_cam = poses.get(pose) if isinstance(pose, str) else None
+        pose, camera = str(view.get("poseId")), view.get("intrinsicId")
+        world_from_cam = poses.get(pose)
         if world_from_cam is None:
             unposed += [] if pose in poses else [place.removeprefix(folder)]
             continue
