@@ -205,6 +205,20 @@ def test_of_several_chunks_that_with_most_aligned_cameras_is_read(tmp_path):
     assert capture.notes[0] == f"chunk 2 (Chunk 1) with 3 cameras is read; {others}"
 
 
+@pytest.mark.parametrize(
+    "off", [('<chunk label="Chunk 1" enabled="true">', '<chunk enabled="0">'), ("<camera ", '<camera enabled="false" ')]
+)
+def test_a_disabled_chunk_and_one_of_disabled_cameras_are_not_read_before_another(off, tmp_path):
+    first, second = (
+        document(sensor_xml({"f": 500.0}), "".join(camera_xml(f"{key} {i}") for i in range(count)))
+        for key, count in (("a", 2), ("b", 3))
+    )
+    second = second[second.index("<chunk") :].replace(*off)
+    capture = parse_metashape(write(tmp_path, first.replace("</document>", second)))
+    assert [frame.name for frame in capture.frames] == ["a 0", "a 1"]
+    assert capture.notes[0].startswith("chunk 1 (Chunk 1) with 2 cameras is read; others")
+
+
 def test_each_camera_has_its_sensor(tmp_path):
     sensors = sensor_xml({"f": 500.0}) + sensor_xml({"f": 300.0}, size=(100, 80), key="3")
     capture = parse_metashape(write(tmp_path, document(sensors, camera_xml("a") + camera_xml("b", sensor="3"))))

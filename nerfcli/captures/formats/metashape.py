@@ -51,7 +51,7 @@ _SPHERICAL = "spherical"
 
 
 def parse_metashape(path: Path) -> Capture:
-    """Read the aligned cameras of the file's chunk, the one with most of them if there are several.
+    """Read the aligned cameras of the file's chunk, of the enabled one with most of them if there are several.
 
     Cameras without a label or a transform (not aligned, or a follower in a camera rig), of a sensor that is not
     calibrated, and disabled ones give no frames. If a component lacks a transform to the world, components are
@@ -67,13 +67,13 @@ def parse_metashape(path: Path) -> Capture:
     """
     chunk, notes = _chunk(path)
     groups = {camera: group.get("label", "") for group in chunk.iterfind("cameras/group") for camera in group}
-    listed = list(chunk.iterfind("cameras//camera"))
-    sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
-    reasons = {camera: _unusable(camera, sensors) for camera in listed}
-    records = [camera for camera in listed if not reasons[camera]]
-    if listed and not records:
-        first = f"{shown(listed[0].get('label'))} is {reasons[listed[0]]}"
-        raise malformed(str(path), f"lists no images with a pose: {first}", "align the photos, and export again")
+    sensors, reasons = _sensors(chunk), _reasons(chunk)
+    records = [camera for camera, reason in reasons.items() if not reason]
+    if reasons and not records:
+        camera, reason = next(iter(reasons.items()))
+        first = f"{shown(camera.get('label'))} is {reason}"
+        hint = "align or enable the photos, and export again"
+        raise malformed(str(path), f"lists no images with a pose: {first}", hint)
     notes += [_left_out(reason, reasons) for reason in dict.fromkeys(reasons.values()) if reason]
     worlds = _worlds_from_chunk(chunk, path)
     components = [record.get("component_id") for record in records]
@@ -107,6 +107,16 @@ def parse_metashape(path: Path) -> Capture:
     return Capture(tuple(frames), kind="metashape", notes=notes)
 
 
+def _sensors(chunk: Element) -> dict[str | None, Element]:
+    return {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
+
+
+def _reasons(chunk: Element) -> dict[Element, str]:
+    """Return for each camera of a chunk why it gives no frame; empty if it gives one."""
+    sensors = _sensors(chunk)
+    return {camera: _unusable(camera, sensors) for camera in chunk.iterfind("cameras//camera")}
+
+
 def _unusable(camera: Element, sensors: Mapping[str | None, Element]) -> str:
     """Return why a camera gives no frame; empty if it gives one."""
     if not _is_enabled(camera):
@@ -137,7 +147,7 @@ def _one_of(kind: str, counts: Mapping[str, int], kept: str) -> list[str]:
 
 
 def _chunk(path: Path) -> tuple[Element, list[str]]:
-    """Return the chunk with most aligned cameras, and a note on the others.
+    """Return the chunk with most cameras that give frames, an enabled one first, and a note on the others.
 
     A chunk is the root's child in an exported file, the root itself in the file of a project.
     """
@@ -146,9 +156,9 @@ def _chunk(path: Path) -> tuple[Element, list[str]]:
     if not chunks:
         raise malformed(str(path), f"has no chunk element, but a {shown(root.tag)}", _EXPECTED)
     names = [f"{number} ({chunk.get('label', '')})" for number, chunk in enumerate(chunks, start=1)]
-    aligned = [sum(bool(_words(one, "transform")) for one in chunk.iterfind("cameras//camera")) for chunk in chunks]
-    best = aligned.index(max(aligned))
-    return chunks[best], _one_of("chunk", dict(zip(names, aligned, strict=True)), names[best])
+    usable = [list(_reasons(chunk).values()).count("") for chunk in chunks]
+    best = max(range(len(chunks)), key=lambda index: (usable[index] * _is_enabled(chunks[index]), usable[index]))
+    return chunks[best], _one_of("chunk", dict(zip(names, usable, strict=True)), names[best])
 
 
 def _worlds_from_chunk(chunk: Element, path: Path) -> dict[str | None, rigid.Similarity | None]:
