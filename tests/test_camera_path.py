@@ -203,7 +203,7 @@ TRANSPOSED = np.array(OPENGL_POSE).reshape(4, 4).T.ravel().tolist()
         ({"camera_to_world": [*OPENGL_POSE[:15], 10**400]}, "camera_to_world is a list of 16"),
         ({"camera_to_world": ["right", *OPENGL_POSE[1:]]}, "camera_to_world is a list of 16"),
         ({"camera_to_world": [[1.0], [2.0, 3.0], [4.0]]}, "camera_to_world is a list of 4"),
-        ({"camera_to_world": TRANSPOSED}, "the last row is 1, 2, 3, 1"),
+        ({"camera_to_world": TRANSPOSED}, "camera_to_world: its last row is 1 2 3 1"),
         ({"camera_to_world": [2.0, *OPENGL_POSE[1:]]}, "is not a rotation"),
         ({"camera_to_world": [0.0, 0, -1, *OPENGL_POSE[3:]]}, "mirrors the scene"),
     ],

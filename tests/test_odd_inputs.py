@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from captures import ring
 from commands import error_of, nerfcli
-from every_format import WITH_PHOTOS, Views
+from every_format import WITH_PHOTOS, Views, numbers
 from PIL import Image
 from views import PINHOLE, capture_of
 
@@ -422,7 +422,7 @@ def test_uneven_scale_and_mirrors_stay_refused(form, block, what, tmp_path):
         parsed(tmp_path)
 
 
-@pytest.mark.parametrize("form", ["metashape", "mvsnet", "pose-files", "transforms"])
+@pytest.mark.parametrize("form", ["metashape", "mvsnet", "pose-files", "3d-scanner-app", "transforms"])
 def test_matrices_that_are_stored_column_by_column_are_refused(form, tmp_path):
     """Read row by row, they would put all cameras at the origin."""
     put(form, tmp_path)
@@ -433,8 +433,19 @@ def test_matrices_that_are_stored_column_by_column_are_refused(form, tmp_path):
         (tmp_path / "transforms.json").write_text(json.dumps(content))
     else:
         put(form, tmp_path, np.swapaxes(POSES, 1, 2))
+    refused_by_columns(tmp_path)
+
+
+def test_a_camera_on_a_body_that_is_stored_column_by_column_is_refused(tmp_path):
+    put("euroc", tmp_path)
+    row = np.array([[0.0, -1, 0, 0.1], [1, 0, 0, -0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]])
+    edited(tmp_path / "mav0/cam0/sensor.yaml", numbers(row), numbers(row.T))
+    refused_by_columns(tmp_path)
+
+
+def refused_by_columns(folder: Path) -> None:
     with pytest.raises(UserError, match=r"last row is .*, expected 0 0 0 1") as caught:
-        parsed(tmp_path)
+        parsed(folder)
     assert "column by column" in caught.value.hint
 
 

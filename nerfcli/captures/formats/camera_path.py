@@ -148,11 +148,6 @@ def _pose(view: dict[str, Any], where: str) -> np.ndarray:
     if isinstance(values, list) and all(isinstance(row, list) for row in values):
         values = [value for row in values for value in row]
     matrix = vector({key: values}, key, 16, where).reshape(4, 4)
-    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise UserError(
-            f"{where}.{key}: the last row is {', '.join(f'{v:.4g}' for v in matrix[3])}",
-            "expected 0, 0, 0, 1: the matrix is stored row by row, with the position in the last column",
-        )
     return opencv_pose(rigid_pose(matrix, f"{where}.{key}"), "opengl")
 
 

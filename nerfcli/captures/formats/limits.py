@@ -66,15 +66,22 @@ def rigid_pose(matrix: np.ndarray, where: str) -> np.ndarray:
     """Return a pose (4, 4) with a rotation orthonormal to 1e-13, from (3, 4) or (4, 4) as a file holds it.
 
     Args:
-        matrix: with a rotation in the upper left and a position in the fourth column; a fourth row is ignored.
+        matrix: with a rotation in the upper left and a position in the fourth column.
         where: the file and field of the matrix, to begin the message.
 
     Raises:
-        UserError: the matrix is not finite, mirrored, or farther from a rotation than rounding explains.
+        UserError: the matrix is not finite, mirrored, farther from a rotation than rounding explains, or has a fourth
+            row other than 0, 0, 0, 1.
     """
     if not plausible(matrix[:3].ravel()):
         what = f"contains a number that is not finite or above {MOST_UNITS:g}"
         raise UserError(f"{where}: {what}", "the pose of this image is invalid; remove its entry")
+    if len(matrix) == 4 and not np.allclose(matrix[3], _LAST_ROW, rtol=0, atol=_MAX_DEVIATION):
+        last = " ".join(f"{value:g}" for value in matrix[3])
+        raise UserError(
+            f"{where}: its last row is {last}, expected 0 0 0 1",
+            "the position is in the last column; write matrices row by row, not column by column",
+        )
     rotation = matrix[:3, :3]
     bend = _bend(rotation)
     if bend > _MAX_DEVIATION:
@@ -119,8 +126,9 @@ class FramePoses:
         found = self._checked(name, where, matrix)
         if found is None:
             return None
-        scaled, scale = found
-        return rigid.inverse(rigid_pose(np.column_stack([scaled[:3, :3], scaled[:3, 3] / scale]), where))
+        scaled, scale = found[0].copy(), found[1]
+        scaled[:3, 3] /= scale
+        return rigid.inverse(rigid_pose(scaled, where))
 
     def read_quaternion(
         self, name: str, where: str, values: Callable[[], Sequence[float] | np.ndarray]
@@ -161,12 +169,6 @@ class FramePoses:
             scale = float(np.sqrt((found[:3, :3] ** 2).sum() / 3))
             if scale < _LEAST_SCALE:
                 raise NotFiniteError(f"{where}: its rotation is zero", "expected a pose")
-            if len(found) == 4 and not np.allclose(found[3], _LAST_ROW, rtol=0, atol=_MAX_DEVIATION):
-                last = " ".join(f"{value:g}" for value in found[3])
-                raise UserError(
-                    f"{where}: its last row is {last}, expected 0 0 0 1",
-                    "the position is in the last column; write matrices row by row, not column by column",
-                )
         except NotFiniteError as error:
             self._lost.append((name, error))
             return None

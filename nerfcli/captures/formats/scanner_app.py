@@ -10,14 +10,11 @@ Source: pwais/psegs, "3DScannerApp Data Parsing"; laanlabs/ARBodyPoseRecorder, b
 import re
 from functools import partial
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
 from nerfcli.captures.axes import opencv_pose
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import malformed, read_json_object, vector
+from nerfcli.captures.formats.fields import matrix, read_json_object
 from nerfcli.captures.formats.format import Format, UserInputs, has_keys
 from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses
@@ -44,9 +41,9 @@ def parse_scanner_app(folder: Path, given: UserInputs = UserInputs()) -> Capture
         if image is None:
             continue
         where, record = str(path), read_json_object(path)
-        matrix = vector(record, "intrinsics", 9, where).reshape(3, 3)
-        camera = fits.matrix(matrix, stored_size(image), f"{where}: intrinsics")
-        pose = poses.read(image.name, f"{where}: {_POSE}", partial(_matrix, record, where))
+        intrinsics = matrix(record, "intrinsics", (3,), 3, where)
+        camera = fits.matrix(intrinsics, stored_size(image), f"{where}: intrinsics")
+        pose = poses.read(image.name, f"{where}: {_POSE}", partial(matrix, record, _POSE, (4,), 4, where))
         if pose is not None:
             depth, confidence = (folder / f"{path.stem.replace('frame', kind)}.png" for kind in ("depth", "conf"))
             found_depth = SensorDepth.found(depth, unit=MILLIMETRE, confidence=confidence)
@@ -56,13 +53,6 @@ def parse_scanner_app(folder: Path, given: UserInputs = UserInputs()) -> Capture
         notes += (f"{len(frames)} of the {len(files)} frames with a pose have a photo",)
     source = "ARKit (3D Scanner App)"
     return Capture(tuple(frames), kind="3d-scanner-app", unit="metre", unit_source=source, notes=notes)
-
-
-def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
-    matrix = vector(record, _POSE, 16, where).reshape(4, 4)
-    if matrix[3].tolist() != [0, 0, 0, 1]:
-        raise malformed(where, f"{_POSE} is not a pose row by row", "expected a last row 0, 0, 0, 1")
-    return matrix
 
 
 def find_scanner_app(path: Path) -> Path | None:
