@@ -15,6 +15,7 @@ from test_new_formats import PLACES, POSES
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.archives import unpacked
 from nerfcli.captures.conversion import TargetOptions
+from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.registry import format_named, recognise
 from nerfcli.captures.loading import load_scene
 from nerfcli.errors import BAD_INPUT, UserError
@@ -228,6 +229,9 @@ def test_frames_of_a_video_are_written_beside_the_result(tmp_path):
         load_scene(tmp_path / "scan")
     assert "they are frames of rgb.mp4; nerfcli convert" in caught.value.hint
     wanted = TargetOptions(format_named("nerfcli"))
+    with pytest.raises(UserError, match="stray-scanner captures have their own cameras"):
+        convert_capture(tmp_path / "scan", tmp_path / "out", wanted, given=UserInputs(camera=VIEWS.camera))
+    assert [path.name for path in tmp_path.iterdir()] == ["scan"]
     convert_capture(tmp_path / "scan", tmp_path / "out/room-scene", wanted)
     scene = load_scene(tmp_path / "out/room-scene")
     assert [frame.name for frame in scene.frames] == [f"frame_{index:06d}.jpg" for index in range(6)]

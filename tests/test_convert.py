@@ -162,6 +162,11 @@ def test_intrinsics_for_a_format_that_has_its_own_are_refused(tmp_path):
     assert "colmap captures have their own cameras" in error_of(result)[0]
     assert "tum, kitti" in error_of(result)[1]
     assert not (tmp_path / "out.json").exists()
+    (tmp_path / "blender").mkdir()
+    (tmp_path / "blender/transforms_train.json").write_text("{}")
+    result = nerfcli("convert", tmp_path / "blender", tmp_path / "out.json", *options)
+    assert result.exit_code == USAGE
+    assert "blender captures have their own cameras" in error_of(result)[0]
 
 
 def test_a_file_that_holds_the_inverse_is_read_so(tmp_path):

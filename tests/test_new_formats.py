@@ -303,6 +303,9 @@ class TestKapture:
         np.testing.assert_array_equal(capture.points, [[1, 2, 3]])
         assert capture.colours is not None
         assert capture.colours.tolist() == [[10, 20, 30]]
+        text(home / "sensors.txt", "cam0, , camera, SIMPLE_PINHOLE, 64, 48, 70, 32, 24\n")
+        with pytest.raises(UserError, match=r"sensors.txt: its cameras are all calibrated"):
+            parse(tmp_path, UserInputs(camera=CAMERA))
 
     def test_poses_of_which_a_part_is_not_known_are_none(self, tmp_path):
         home = WITH_PHOTOS["kapture"](VIEWS, tmp_path).parent

@@ -131,6 +131,20 @@ class Conversion:
     notes: tuple[str, ...] = ()
 
 
+def recognise_given(source: Path, given: UserInputs) -> tuple[Format, Path]:
+    """Return the format of the capture in a file or folder, and the file or folder in it to parse.
+
+    Raises:
+        UserError: there is no capture, or a camera is given that its format does not take.
+    """
+    form, found = recognise(source)
+    if given.camera is not None and not form.takes_camera:
+        names = ", ".join(form.name for form in FORMATS if form.takes_camera)
+        hint = f"remove --intrinsics, which is for {names}"
+        raise UserError(f"{found}: {form.name} captures have their own cameras", hint, exit_code=2)
+    return form, found
+
+
 def load(source: Path, given: UserInputs, overrides: ConventionOverrides) -> tuple[Format, Path, Capture]:
     """Read the capture in a file or folder, in the convention given by the user.
 
@@ -138,14 +152,9 @@ def load(source: Path, given: UserInputs, overrides: ConventionOverrides) -> tup
         The format, the file or folder that was parsed, the capture.
 
     Raises:
-        UserError: there is no capture, it is damaged, a camera is given that its format does not take, or the given
-            axes are invalid.
+        UserError: see `recognise_given`, or the capture is damaged, or the given axes are invalid.
     """
-    form, found = recognise(source)
-    if given.camera is not None and not form.takes_camera:
-        names = ", ".join(form.name for form in FORMATS if form.takes_camera)
-        hint = f"remove --intrinsics, which is for {names}"
-        raise UserError(f"{found}: {form.name} captures have their own cameras", hint, exit_code=2)
+    form, found = recognise_given(source, given)
     capture = form.parse(found, given)
     if given.masks is not None:
         capture = with_masks(capture, given.masks)

@@ -8,9 +8,16 @@ from typing import Any
 from nerfcli.captures import detect
 from nerfcli.captures.archives import unpacked
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.conversion import TOLERANCE_PX, ConventionOverrides, Conversion, TargetOptions, convert, load
+from nerfcli.captures.conversion import (
+    TOLERANCE_PX,
+    ConventionOverrides,
+    Conversion,
+    TargetOptions,
+    convert,
+    load,
+    recognise_given,
+)
 from nerfcli.captures.formats.format import Format, UserInputs
-from nerfcli.captures.formats.registry import recognise
 from nerfcli.captures.orientation import STORED, describe_rescaling, in_pixels, other_sizes
 from nerfcli.captures.world import WorldFrame, in_world_frame
 from nerfcli.errors import UserError, listed, several
@@ -80,7 +87,7 @@ def convert_capture(
 
 def _with_frames(source: Path, output: Output, given: UserInputs, reporter: Reporter) -> UserInputs:
     """Return the user's inputs, with the frames of a capture's video, written beside the output if it has no photos."""
-    form, found = recognise(source)
+    form, found = recognise_given(source, given)
     video = None if given.images is not None else form.video(found)
     if video is None or any(frame.has_photo for frame in form.parse(found, given).frames):
         return given

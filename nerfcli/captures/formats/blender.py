@@ -132,7 +132,6 @@ FORMAT = Format(
     open_axes=True,
     files=("transforms_train.json", "transforms_val.json", "transforms_test.json"),
     lacks=("points",),
-    takes_camera=True,
     unused_splits=("val",),  # views for choosing settings
     listed_by=lambda frame: SPLITS.index(frame.split or "train"),
     write=write_blender,

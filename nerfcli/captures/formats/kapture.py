@@ -43,6 +43,9 @@ def parse_kapture(folder: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the photos that have a pose, of all cameras; the user gives that of sensors whose model is not known."""
     home = folder / SENSORS
     cameras = {row.cells[0]: row for row in _rows(home / "sensors.txt", least=3) if row.cells[2] == "camera"}
+    if given.camera is not None and not any(map(_is_unknown, cameras.values())):
+        hint = f"remove --intrinsics, which is for those of the model {_UNKNOWN}"
+        raise UserError(f"{home / 'sensors.txt'}: its cameras are all calibrated", hint, exit_code=2)
     poses = {(row.cells[0], row.cells[1]): row for row in _rows(home / "trajectories.txt", least=9)}
     rigs: dict[str, list[Row]] = {}
     for row in _rows(home / "rigs.txt", least=9) if (home / "rigs.txt").is_file() else []:
@@ -107,13 +110,17 @@ def _transform(row: Row) -> np.ndarray | None:
     return rigid.from_parts(rigid.rotation_from_quaternion(values[:4]), values[4:])
 
 
+def _is_unknown(row: Row) -> bool:
+    return _UNKNOWN in map(str.upper, row.cells[3:4])
+
+
 def _camera(row: Row, given: Camera | None) -> Camera:
     if len(row.cells) < 6:
         raise malformed(row.where, "has no camera model with width and height", "expected MODEL, width, height, ...")
     model, *words = row.cells[3:]
     width, height, *params = numbers(words, len(words), row.where)
     size = size_of(width, height, row.where)
-    if model.upper() != _UNKNOWN:
+    if not _is_unknown(row):
         return checked_camera(model.upper(), *size, tuple(params), where=row.where)
     if given is None:
         raise UserError(f"{row.where}: the camera is not calibrated ({_UNKNOWN})", GIVE_CAMERA)
