@@ -310,6 +310,8 @@ class TestKapture:
     def test_poses_of_which_a_part_is_not_known_are_none(self, tmp_path):
         home = WITH_PHOTOS["kapture"](VIEWS, tmp_path).parent
         rows = (home / "trajectories.txt").read_text().splitlines()
+        text(home / "trajectories.txt", "\n".join([*rows[:2], f"{rows[2]},"]))
+        assert parse(tmp_path).notes == ()
         text(home / "trajectories.txt", "\n".join([*rows[:2], "0001, cam0, , , , , 1, 2, 3"]))
         assert parse(tmp_path).notes == ("1 photo without a pose left out: walk/1.jpg",)
 

@@ -101,7 +101,7 @@ def _pose_at(
 
 def _transform(row: Row) -> np.ndarray | None:
     """Return the transform (4, 4) of a row's last seven cells; None if a part of it is not known."""
-    cells = row.cells[2:]
+    cells = [*row.cells[2:9], *filter(None, row.cells[9:])]  # a comma may end the line
     if not all(cells[:7]):
         return None
     values = np.array(numbers(cells, 7, row.where))
