@@ -134,6 +134,7 @@ def test_own_scene_is_read_back(own, tmp_path):
         ({"model": None}, "model is None"),
         ({"model": "sparse/1"}, r"sparse/1.cameras\.txt: No such file"),
         ({"unit": "mile"}, "unit is 'mile'"),
+        ({"split": None}, "split.test is not a list"),
         ({"split": {}}, "split.test is not a list"),
         ({"split": {"test": [1]}}, "split.test is not a list"),
     ],

@@ -104,12 +104,12 @@ def _listed_splits(content: dict[str, Any], path: Path) -> dict[str, str | None]
     """Return the split of the frames that are not for training; None for those that the split leaves out."""
     listed = content.get("split")
     splits: dict[str, str | None] = {}
-    for part in (UNUSED, "val", "test"):
+    for part in ("test", "val", UNUSED):  # a photo in several counts for the first
         names = listed.get(part, None if part == "test" else []) if isinstance(listed, dict) else None
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             what = f"{path}: split.{part} is not a list of image names"
             raise UserError(what, 'expected "split": {"test": ["a.jpg", ...]}')
-        splits |= dict.fromkeys(names, None if part == UNUSED else part)
+        splits = dict.fromkeys(names, None if part == UNUSED else part) | splits
     return splits
 
 
