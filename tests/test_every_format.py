@@ -87,7 +87,8 @@ def test_photos_in_another_folder_are_given(name, tmp_path):
     form, found = recognise(file if name == "run" else tmp_path / "capture")
     frames = form.parse(found, UserInputs(images=tmp_path / "elsewhere")).frames
     assert len(frames) == len(POSES)
-    assert {frame.image.parent for frame in frames if frame.has_photo and frame.image} == {tmp_path / "elsewhere"}
+    assert all(frame.has_photo for frame in frames)
+    assert {frame.image.parent for frame in frames if frame.image} == {tmp_path / "elsewhere"}
 
 
 @pytest.mark.parametrize("name", WITHOUT_PHOTOS)
