@@ -145,6 +145,12 @@ def test_a_name_with_a_percent_sign_is_first_taken_as_it_is(tmp_path):
     assert [levels(find(tmp_path, [name]).paths) for name in listed] == [[1], [0], [0], [3], [2], [2]]
 
 
+@pytest.mark.parametrize("listed", ["C:\\trip\\a.png", "file:///C:/trip/a.png", "file://C:/trip/a.png", " C:/a.png"])
+def test_an_absolute_path_is_no_name(listed, tmp_path):
+    photos(tmp_path, ["images/a.png"])
+    assert find(tmp_path, [listed]).names == ("a.png",)
+
+
 @pytest.mark.parametrize(
     ("on_disk", "listed", "two"),
     [

@@ -50,7 +50,7 @@ class Name:
     @classmethod
     def of(cls, listed: str) -> "Name":
         pure = PurePosixPath(plain_name(listed))
-        is_absolute = pure.is_absolute() or _DRIVE.match(listed) is not None
+        is_absolute = pure.is_absolute() or _DRIVE.match(str(pure)) is not None
         parts = [part for part in pure.parts[:-1] if part.strip("/") not in ("", "..") and not _DRIVE.fullmatch(part)]
         whole, stem = _plain(pure.name), _plain(_SUFFIX.sub("", pure.name))
         # Converters also append a suffix: IMG_1.HEIC becomes IMG_1.HEIC.jpg. But IMG_1.jpg.png is a mask.
