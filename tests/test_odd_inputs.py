@@ -31,7 +31,7 @@ from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.lenses import Fits, Terms
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.formats.ply import write_points
-from nerfcli.captures.formats.registry import recognise
+from nerfcli.captures.formats.registry import recognise, with_masks
 from nerfcli.errors import BAD_INPUT, UserError
 
 CAPTURE = capture_of([PINHOLE])
@@ -777,6 +777,13 @@ def test_masks_that_are_missing_are_left_out_and_named(tmp_path):
     capture = parsed(tmp_path)
     assert [frame.mask for frame in capture.frames] == [tmp_path / "masks/0.png", *[None] * (COUNT - 1)]
     assert capture.notes == ("1 mask named in transforms.json left out, not found: masks/1.png",)
+
+
+def test_masks_are_found_by_the_photos_as_they_are_on_disk(tmp_path):
+    photos(tmp_path, [*numbered("images/my view {}.png"), "masks/my view 1.png"])
+    transforms(tmp_path, numbered("images/my%20view%20{}.png"))
+    capture = with_masks(parsed(tmp_path), tmp_path / "masks")
+    assert [frame.mask for frame in capture.frames] == [None, tmp_path / "masks/my view 1.png", *[None] * (COUNT - 2)]
 
 
 def test_depth_maps_under_other_names_and_those_that_are_missing(tmp_path):

@@ -169,7 +169,7 @@ def depths_beside(photos: Path) -> dict[str, SensorDepth]:
 
 
 def with_masks(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with masks from a folder, by the names of the photos or by the ends of these.
+    """Return the capture with masks from a folder, by the names of the photos, the ends of these, or those on disk.
 
     Photos without a mask there keep the one that they have.
 
@@ -178,7 +178,7 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
     """
     if not folder.is_dir():
         raise UserError(f"the mask folder {folder} does not exist", "give a folder with a mask for each photo")
-    found = [mask_of(frame.name, folder) for frame in capture.frames]
+    found = [mask_of(f.name, folder) or (mask_of(f.image.name, folder) if f.image else None) for f in capture.frames]
     if not any(found):
         raise UserError(
             f"{folder} contains no mask for any of the {len(found)} photos",
