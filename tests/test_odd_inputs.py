@@ -521,7 +521,7 @@ def test_two_keys_that_give_different_focal_lengths_are_said(tmp_path):
     assert read_again(tmp_path, fisheye).notes == ()
 
 
-@pytest.mark.parametrize("listed", ["C:\\out\\points.ply", "Points.PLY", "file:///out/points.ply"])
+@pytest.mark.parametrize("listed", ["C:\\out\\points.ply", "Points.PLY", "file:///out/%70oints.ply"])
 def test_a_cloud_of_points_is_found_beside_the_file(listed, tmp_path):
     write_points(CAPTURE, tmp_path / "points.ply")
     capture = read_again(tmp_path, written(tmp_path, ply_file_path=listed))

@@ -52,11 +52,11 @@ class Name:
         pure = PurePosixPath(plain_name(listed))
         is_absolute = pure.is_absolute() or _DRIVE.match(str(pure)) is not None
         parts = [part for part in pure.parts[:-1] if part.strip("/") not in ("", "..") and not _DRIVE.fullmatch(part)]
-        whole, stem = _plain(pure.name), _plain(_SUFFIX.sub("", pure.name))
+        whole, stem = folded(pure.name), folded(_SUFFIX.sub("", pure.name))
         # Converters also append a suffix: IMG_1.HEIC becomes IMG_1.HEIC.jpg. But IMG_1.jpg.png is a mask.
         suffix = pure.suffix.lower()
         stems = (stem, whole) if suffix in HEIC_SUFFIXES else (stem,) if suffix in IMAGE_SUFFIXES else (whole, stem)
-        return cls(listed, str(pure), tuple(map(_plain, parts)), stems, is_absolute)
+        return cls(listed, str(pure), tuple(map(folded, parts)), stems, is_absolute)
 
     @property
     def suffix(self) -> str:
@@ -90,13 +90,13 @@ class Place:
         for folder, subfolders, files in os.walk(self.path):
             parts = Path(folder).relative_to(self.path).parts
             if not parts and self.subfolders is not None:
-                subfolders[:] = [name for name in subfolders if _plain(name) in self.subfolders]
+                subfolders[:] = [name for name in subfolders if folded(name) in self.subfolders]
             subfolders[:] = [name for name in subfolders if not name.startswith(".")]
             for file in files:
                 stem, suffix = os.path.splitext(file)
                 if suffix.lower() in IMAGE_SUFFIXES and not file.startswith("."):
-                    of_stem = found.setdefault(_plain(stem), {})
-                    of_stem.setdefault(_plain(parts[-1]) if parts else "", []).append((*parts, file))
+                    of_stem = found.setdefault(folded(stem), {})
+                    of_stem.setdefault(folded(parts[-1]) if parts else "", []).append((*parts, file))
         return found
 
 
@@ -118,7 +118,7 @@ class Search:
     rank: tuple[bool, int, bool, bool, int] = (False, 0, False, False, 0)
 
 
-def _plain(text: str) -> str:
+def folded(text: str) -> str:
     """Return a text without what other machines and programs change.
 
     These are the case of letters, composed accents, spaces at the ends, and the percent-encoding of addresses.
@@ -227,7 +227,7 @@ def _matches(name: Name, photos: Photos, place: Place, *, has_exact: bool) -> tu
 
 def _score(name: Name, parts: tuple[str, ...], *, has_exact: bool) -> tuple[int, ...] | None:
     """Return how well the parts of a photo's path fit a name, to compare with others; None if they do not."""
-    folders = [_plain(part) for part in parts[:-1]]
+    folders = [folded(part) for part in parts[:-1]]
     common = 0
     while common < min(len(folders), len(name.folders)) and folders[-1 - common] == name.folders[-1 - common]:
         common += 1

@@ -24,7 +24,7 @@ from nerfcli.captures.formats.format import Format, UserInputs, find_json
 from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses
 from nerfcli.captures.formats.photo_names import find_photos, seen_from
-from nerfcli.captures.formats.photo_search import Name, plain_name
+from nerfcli.captures.formats.photo_search import Name, folded, plain_name
 from nerfcli.captures.formats.ply import read_points, write_points
 from nerfcli.captures.formats.record3d import find_record3d
 from nerfcli.captures.formats.run_cameras import find_run
@@ -253,7 +253,7 @@ def _points_beside(path: Path, content: dict[str, Any]) -> tuple[np.ndarray, np.
     if not isinstance(cloud, str):
         raise malformed(str(path), f"ply_file_path is {cloud!r:.80}", "expected the path of a PLY file as text")
     name = PurePosixPath(plain_name(cloud)).name
-    same = (there for there in sorted(path.parent.iterdir()) if there.name.lower() == name.lower())
+    same = (there for there in sorted(path.parent.iterdir()) if folded(there.name) == folded(name))
     places = (path.parent / plain_name(cloud), path.parent / name, *same)
     place = next((place for place in places if place.is_file()), None)
     if place is None:
