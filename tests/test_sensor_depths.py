@@ -266,7 +266,10 @@ def write_exr(path: Path) -> None:
 WRITERS: dict[str, tuple[Callable[[Path], object], float]] = {
     "a.png": (lambda path: cv2.imwrite(str(path), LEVELS), 1e-3),
     "a.tif": (lambda path: tifffile.imwrite(path, Z), 1.0),
+    "big-endian.tif": (lambda path: tifffile.imwrite(path, Z, byteorder=">"), 1.0),
+    "lzw.tif": (lambda path: cv2.imwrite(str(path), Z), 1.0),
     "a.pgm": (lambda path: cv2.imwrite(str(path), LEVELS), 1e-3),
+    "up to 9999.pgm": (lambda path: path.write_bytes(b"P5 30 20 9999\n" + LEVELS.astype(">u2").tobytes()), 1e-3),
     "a.npy": (lambda path: np.save(path, Z), 1.0),
     "a.exr": (write_exr, 1.0),
 }
@@ -281,12 +284,13 @@ def test_maps_of_other_libraries_are_read(tmp_path, name):
     assert z == pytest.approx(Z, abs=0.5e-3 if unit == 1e-3 else 0.0)
 
 
-def test_what_was_not_measured_has_no_depth(tmp_path):
-    levels = np.full((20, 30), 2000, np.uint16)
+@pytest.mark.parametrize("name", ["a.png", "a.pgm", "a.npy"])
+def test_what_was_not_measured_has_no_depth(tmp_path, name):
+    path, levels = tmp_path / name, np.full((20, 30), 2000, np.uint16)
     levels[5, 5], levels[10, 10] = 0, 65535
-    cv2.imwrite(str(tmp_path / "a.png"), levels)
+    cv2.imwrite(str(path), levels) if path.suffix != ".npy" else np.save(path, levels.astype(">u2"))
     Image.new("RGB", (300, 200)).save(tmp_path / "photo.png")
-    z = read_sensor_depth(SensorDepth(tmp_path / "a.png", 1e-3), tmp_path / "photo.png").z
+    z = read_sensor_depth(SensorDepth(path, 1e-3), tmp_path / "photo.png").z
     assert np.argwhere(np.isnan(z)).tolist() == [[5, 5], [10, 10]]
 
 

@@ -22,7 +22,6 @@ from numpy.lib import format as npy_format
 from nerfcli.cameras.frame import SensorDepth
 from nerfcli.errors import UserError, reason_of
 from nerfcli.photos.exif import read_exif
-from nerfcli.photos.images import opened
 
 # Neighbours whose depths differ by more than this factor are the two sides of an edge, where sensors mix both: surfaces
 # at 75 degrees from the line of sight stay below at 256 pixels for 60 degrees.
@@ -58,7 +57,7 @@ def read_sensor_depth(depth: SensorDepth, photo: Path) -> DepthReadings:
     exif = read_exif(photo)
     stored = (exif.height, exif.width) if exif.orientation >= 5 else (exif.width, exif.height)
     z = _numbers(depth.path, stored[0] / stored[1])
-    if z.dtype == np.uint16:
+    if z.dtype.newbyteorder("=") == np.uint16:
         z = np.where(z == _UNKNOWN_LEVEL, 0, z)
     z = z.astype(np.float32) * np.float32(depth.unit)
     z[~((z > 0) & np.isfinite(z))] = np.nan
@@ -92,10 +91,11 @@ def _numbers(path: Path, aspect: float) -> np.ndarray:
                 found = np.asarray(channels.get("Z", next(iter(channels.values()))).pixels)
             case ".depth" | ".conf":
                 found = _unpacked(path, np.float32 if path.suffix.lower() == ".depth" else np.uint8, aspect)
-            case _:
-                with opened(path) as image:
-                    found = np.array(image)
-    except (OSError, ValueError, RuntimeError, TypeError, EOFError, StopIteration) as error:
+            case _:  # with OpenCV: Pillow widens levels of a PGM to 16 bits, and garbles 32 bits of big-endian TIFF
+                found = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+                if found is None:
+                    raise ValueError("damaged, or no picture")
+    except (OSError, ValueError, RuntimeError, TypeError, EOFError, StopIteration, cv2.error) as error:
         raise UserError(f"{path} is not a depth map: {reason_of(error)}", _HINT) from error
     found = found.squeeze()
     if found.ndim != 2 or not found.size or found.dtype.kind not in "uif":
