@@ -291,8 +291,11 @@ def test_a_disk_that_is_full_when_a_scene_is_replaced_leaves_the_earlier_one(
 @pytest.mark.usefixtures("same_process")
 def test_a_split_that_holds_out_no_placed_photo_leaves_an_earlier_scene(photos: Path, again: Path, tmp_path: Path):
     (tmp_path / "test.txt").write_text("wall.png")
-    with pytest.raises(UserError, match=r"holds out 0 of 7 photos"):
+    with pytest.raises(UserError, match=r"holds out 0 of 7 photos") as refused:
         estimate(photos, again, replace(ONE_THREAD, holdout=str(tmp_path / "test.txt")))
+    assert f"details are in {again / 'work' / 'poses_report.json'}" in (refused.value.hint or "")
+    images = json.loads((again / "work" / "poses_report.json").read_text())["images"]
+    assert [image["name"] for image in images if image["reason"]] == ["wall.png"]
     assert is_same_scene(again, photos, ONE_THREAD)
 
 

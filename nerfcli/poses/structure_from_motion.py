@@ -94,7 +94,10 @@ def estimate_poses(
             if not (settings.accept_refused and report.models):
                 raise _refused(add_advice(error, report.moving_foreground), report, scene_dir)
             notify(f"accepted because of --accept-refused: {error.message}")
-        split = _split(report)  # may be refused: an earlier scene is still there
+        try:
+            split = _split(report)  # before an earlier scene is replaced
+        except UserError as error:
+            raise _reported(error, report, scene_dir) from error
         publish(scene_dir, lambda: _describe_scene(report, scene_dir, photos_dir, split=split, given=given))
     for note in closing_notes(report):
         notify(note)
@@ -237,15 +240,24 @@ def _split(report: PosesReport) -> dict[str, str | None]:
 
 def _refused(error: UserError, report: PosesReport, scene_dir: Path) -> UserError:
     """Make the error for a refused result, and keep its report and its model, but not as a scene."""
-    older = (scene_dir / scene_folder.SCENE_FILE).is_file()
-    folder = scene_dir / "work" if older else scene_dir
-    path = folder / "poses_report.json"
-    write_json(path, report.to_json())
+    error = _reported(error, report, scene_dir)
     if not report.models:
-        return UserError(error.message, f"{error.hint}; details are in {path}", error.exit_code)
-    model = keep_refused(scene_dir, folder)
+        return error
+    model = keep_refused(scene_dir, _folder_of_refused(scene_dir))
     hint = (
-        f"{error.hint}; details are in {path}, the refused model of {report.registered} photos is in {model} (open "
+        f"{error.hint}, the refused model of {report.registered} photos is in {model} (open "
         f"{POINTS_FILE} in a mesh viewer), and --accept-refused uses it anyway"
     )
     return UserError(error.message, hint, error.exit_code)
+
+
+def _reported(error: UserError, report: PosesReport, scene_dir: Path) -> UserError:
+    """Make the error for a result that does not become the scene, and keep its report."""
+    path = _folder_of_refused(scene_dir) / "poses_report.json"
+    write_json(path, report.to_json())
+    return UserError(error.message, f"{error.hint}; details are in {path}", error.exit_code)
+
+
+def _folder_of_refused(scene_dir: Path) -> Path:
+    older = (scene_dir / scene_folder.SCENE_FILE).is_file()
+    return scene_dir / "work" if older else scene_dir
