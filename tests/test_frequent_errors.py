@@ -25,7 +25,10 @@ def project(folder: Path) -> Path:
     ("files", "said"),
     [
         ((), "expected photos, such as .jpg, .png, .heic, "),
-        (("a.svg", "b.svg", "notes.txt"), "there are only 2 .svg, 1 .txt; expected photos, such as .jpg, "),
+        (
+            ("a.raw", "b.raw", "c.ptx", "notes.txt"),
+            "there are only 2 .raw, 1 .ptx, 1 .txt; expected photos, such as .jpg, ",
+        ),
         (("DCIM/a.jpg",), "there are photos in {0}/DCIM; give that folder"),
     ],
 )

@@ -5,10 +5,11 @@ _RAW = "is a raw file: develop it to JPEG or 16-bit TIFF"
 _LAYERS = "is a picture of several layers: export it as JPEG or 16-bit TIFF"
 _PAIR = "holds the two pictures of a stereo camera: save each as a JPEG"
 _OTHER = "is a picture in a format that is not read: convert it to JPEG or PNG"
+# Not .raw, .ptx and .cap, which are raw photos of few cameras, but dumps of depths, scans and recordings beside photos.
 UNREAD = {
     **dict.fromkeys((".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".raf", ".orf"), _RAW),
-    **dict.fromkeys((".rw2", ".pef", ".srw", ".x3f", ".3fr", ".iiq", ".rwl", ".gpr", ".raw", ".fff", ".mos"), _RAW),
-    **dict.fromkeys((".kdc", ".dcr", ".k25", ".erf", ".mef", ".mrw", ".ptx", ".cap"), _RAW),
+    **dict.fromkeys((".rw2", ".pef", ".srw", ".x3f", ".3fr", ".iiq", ".rwl", ".gpr", ".fff", ".mos"), _RAW),
+    **dict.fromkeys((".kdc", ".dcr", ".k25", ".erf", ".mef", ".mrw"), _RAW),
     **dict.fromkeys((".exr", ".hdr", ".pfm"), _FLOAT),
     **dict.fromkeys((".psd", ".psb", ".xcf"), _LAYERS),
     **dict.fromkeys((".jps", ".pns"), _PAIR),
