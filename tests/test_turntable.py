@@ -22,8 +22,10 @@ from nerfcli.doctor.examination import Diagnosis, examine, find_subject
 from nerfcli.errors import UserError
 from nerfcli.matching.stationary import Motions, Stationary, motions, still_px, together
 from nerfcli.pages.findings import LOOK
-from nerfcli.poses.engine.turntable import add_advice, describe_motions
+from nerfcli.poses.engine import turntable as module
+from nerfcli.poses.engine.turntable import add_advice, describe_motions, mask_turning_object, scene_masks
 from nerfcli.poses.input import still_background as still
+from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.structure_from_motion import estimate_poses
 
@@ -272,6 +274,32 @@ def made(capture: Turntable, tmp_path_factory: pytest.TempPathFactory) -> tuple[
     return folder, *solved(folder / "images", folder / "scene")
 
 
+@pytest.fixture
+def job(capture: Turntable, tmp_path: Path) -> Job:
+    """Return the worker's job for a turntable whose masks have been made."""
+    work = tmp_path / "scene" / "work"
+    (work / "photos").mkdir(parents=True)
+    names = tuple(f"{number}.png" for number in range(len(capture.photos)))
+    for name, photo in zip(names, capture.photos, strict=True):
+        Image.fromarray(photo).save(work / "photos" / name)
+    made = Job(
+        folder=str(work),
+        files=names,
+        originals=str(work / "photos"),
+        names=names,
+        keys=names,
+        groups=(CameraGroup(tuple(range(len(names))), "PINHOLE", 480, 360),),
+        pairs=(),
+        neighbours=0,
+        max_image_size=480,
+        max_features=500,
+        seed=0,
+        threads=1,
+    )
+    mask_turning_object(made, lambda note: None)
+    return made
+
+
 class TestPoses:
     def test_object_is_solved_as_if_the_camera_went_around_it(
         self, capture: Turntable, made: tuple[Path, dict, list[str]]
@@ -315,6 +343,23 @@ class TestPoses:
             assert (np.asarray(Image.open(mask)) == narrower).all()
             assert report["moving_foreground"]["masked"]
             assert report["images"][0]["registered"]
+
+    @pytest.mark.parametrize("found", [None, np.ones((36, 48), bool)])
+    def test_masks_that_were_mended_are_used_whatever_is_found(
+        self, job: Job, monkeypatch: pytest.MonkeyPatch, found: np.ndarray | None
+    ) -> None:
+        """Also where the background of a photo matches no other any more, and where the masks made now are refused."""
+        mended = []
+        for name in job.names:
+            path = scene_masks(job) / f"{name}.png"
+            mended.append(np.asarray(Image.open(path)).copy())
+            mended[-1][:150] = False  # most of the object
+            Image.fromarray(mended[-1]).save(path)
+        monkeypatch.setattr(module, "_make_masks", lambda *_, **__: [found] * len(job.files))
+        used, facts = mask_turning_object(job, lambda note: None)
+        assert facts is not None
+        assert (facts["masked"], facts["unmasked"]) == (True, [])
+        assert [mask.used_fraction for mask in used.masks] == [mask.mean() for mask in mended]
 
     def test_camera_at_two_heights_that_is_turned_a_little_between_photos(self, tmp_path: Path) -> None:
         """The background of either height moves by 10 px (standard deviation) from photo to photo, 1.7 % of 600 px.

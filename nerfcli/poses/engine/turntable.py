@@ -151,14 +151,17 @@ def mask_turning_object(job: Job, tell: Tell) -> tuple[Job, dict[str, Any] | Non
         "found": motions.found,
     }
     masks: list[np.ndarray | None] = [None] * len(job.files)
+    edited: dict[str, np.ndarray] = {}
     if motions.found:
         tell("the object turns in front of a background that does not, as on a turntable: making masks of it")
-        masks = _make_masks(photos, training, others=job.held_out)
-        facts |= _judge_masks(masks, compared)
+        edited, made = _edited_masks(job, tell), _make_masks(photos, training, others=job.held_out)
+        masks = [edited.get(name, mask) for name, mask in zip(job.names, made, strict=True)]
+        if len(edited) < len(masks):  # the user's are not judged
+            facts |= _judge_masks(made, compared)
     facts["masked"] = facts.get("why_not") is None and motions.found
     facts["unmasked"] = [name for name, mask in zip(job.names, masks, strict=True) if mask is None]
     if facts["masked"]:
-        job = replace(job, masks=_write_masks(job, masks, tell))
+        job = replace(job, masks=_write_masks(job, masks, edited))
     write_stage(Path(job.folder) / _STAGE, _key(job), facts)
     return job, facts
 
@@ -305,7 +308,21 @@ def _judge_masks(masks: Sequence[np.ndarray | None], pairs: Sequence[ComparedPai
     return facts
 
 
-def _write_masks(job: Job, masks: Sequence[np.ndarray | None], tell: Tell) -> tuple[WorkMask, ...]:
+def _edited_masks(job: Job, tell: Tell) -> dict[str, np.ndarray]:
+    """Return the masks, by the photo's name, that the user has changed since they were written for this photo."""
+    written, edited = read_stage(Path(job.folder) / _WRITTEN, _VERSION) or {}, {}
+    for name, key in zip(job.names, job.keys, strict=True):
+        path = scene_masks(job) / f"{name}.png"
+        photo_key, mask_key = written.get(name, ("", ""))
+        if key == photo_key and path.is_file() and file_key(path) != mask_key:
+            try:
+                edited[name] = read_mask(path, Path(job.originals) / name) > 0
+            except UserError as error:
+                tell(f"{error.message}: making it anew")
+    return edited
+
+
+def _write_masks(job: Job, masks: Sequence[np.ndarray | None], edited: Collection[str]) -> tuple[WorkMask, ...]:
     """Write a mask of each photo for pycolmap, and those that were found for the user, except edited ones."""
     job.mask_folder.mkdir(exist_ok=True)
     stage = Path(job.folder) / _WRITTEN
@@ -316,30 +333,14 @@ def _write_masks(job: Job, masks: Sequence[np.ndarray | None], tell: Tell) -> tu
         if mask is None:
             laid_out.append(write_no_mask(target, size))
             continue
-        path = scene_masks(job) / f"{name}.png"
-        used = _edited(path, Path(job.originals) / name, key, written.get(name), tell)
-        if used is None:
-            used = still.enlarged(mask, size)
+        if name not in edited:
+            mask, path = still.enlarged(mask, size), scene_masks(job) / f"{name}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(used).save(path)
+            Image.fromarray(mask).save(path)
             written[name] = [key, file_key(path)]
-        laid_out.append(write_mask(target, used))
+        laid_out.append(write_mask(target, mask))
     write_stage(stage, _VERSION, written)
     return tuple(laid_out)
-
-
-def _edited(path: Path, photo: Path, key: str, written: Sequence[str] | None, tell: Tell) -> np.ndarray | None:
-    """Return a mask that the user has changed since it was written for this photo; None if it was not, or does not fit.
-
-    `written` has the hashes of the photo and of the mask at that time.
-    """
-    if written is None or not path.is_file() or key != written[0] or file_key(path) == written[1]:
-        return None
-    try:
-        return read_mask(path, photo) > 0
-    except UserError as error:
-        tell(f"{error.message}: making it anew")
-        return None
 
 
 def _key(job: Job) -> str:
