@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -360,6 +361,16 @@ class TestPoses:
         assert facts is not None
         assert (facts["masked"], facts["unmasked"]) == (True, [])
         assert [mask.used_fraction for mask in used.masks] == [mask.mean() for mask in mended]
+
+    def test_masks_of_a_run_that_was_interrupted_are_not_taken_for_mended_ones(self, job: Job) -> None:
+        expected = mask_turning_object(job, lambda note: None)[0].masks
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(still, "enlarged", lambda mask, size: np.ones(size[::-1], bool))
+            patched.setattr(module, "write_mask", Mock(side_effect=KeyboardInterrupt))
+            with pytest.raises(KeyboardInterrupt):
+                mask_turning_object(job, lambda note: None)
+        assert np.asarray(Image.open(scene_masks(job) / f"{job.names[0]}.png")).all()
+        assert mask_turning_object(job, lambda note: None)[0].masks == expected
 
     def test_camera_at_two_heights_that_is_turned_a_little_between_photos(self, tmp_path: Path) -> None:
         """The background of either height moves by 10 px (standard deviation) from photo to photo, 1.7 % of 600 px.

@@ -327,6 +327,8 @@ def _write_masks(job: Job, masks: Sequence[np.ndarray | None], edited: Collectio
     job.mask_folder.mkdir(exist_ok=True)
     stage = Path(job.folder) / _WRITTEN
     written = read_stage(stage, _VERSION) or {}
+    written = {name: keys for name, keys in written.items() if name in edited or name not in job.names}
+    write_stage(stage, _VERSION, written)  # what is interrupted below must not be taken for edited
     laid_out = []
     for name, file, key, mask in zip(job.names, job.files, job.keys, masks, strict=True):
         size, target = image_size(job.photos / file), job.mask_folder / f"{file}.png"
