@@ -51,6 +51,14 @@ def test_frames_stand_beside_the_output(clip, estimated):
     assert estimated == [("out/kitchen-frames", "out/kitchen", 6)]
 
 
+def test_the_output_may_be_the_folder_that_one_is_in(clip, estimated, tmp_path, monkeypatch):
+    """Regression: a traceback, as "." has no name."""
+    (tmp_path / "kitchen").mkdir()
+    monkeypatch.chdir(tmp_path / "kitchen")
+    assert nerfcli("poses", Path("..") / clip, "--frames", "6", "-o", ".").stdout == ".\n"
+    assert estimated == [(f"{tmp_path}/kitchen-frames", ".", 6)]
+
+
 def test_run_takes_a_video_too(clip, estimated, monkeypatch):
     def stop(*args: Any, **settings: Any) -> None:
         raise UserError("far enough", "")

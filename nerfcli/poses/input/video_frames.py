@@ -148,8 +148,8 @@ def _path(seconds: np.ndarray, moved: np.ndarray) -> np.ndarray:
 
 def frames_folder(scene_dir: Path) -> Path:
     """Return the folder of the video frames for a scene: next to it, clip-frames for clip-scene."""
-    name = scene_dir.resolve().name if scene_dir.name in ("", "..") else scene_dir.name
-    return scene_dir.with_name("frames" if name == "scene" else f"{name.removesuffix('-scene')}-frames")
+    scene = scene_dir.resolve() if scene_dir.name in ("", "..") else scene_dir
+    return scene.with_name("frames" if scene.name == "scene" else f"{scene.name.removesuffix('-scene')}-frames")
 
 
 def extract_frames(
