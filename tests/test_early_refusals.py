@@ -1,5 +1,6 @@
 """Commands refuse before any work what they can know by then: wrong inputs, read-only folders, nothing left to do."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -76,6 +77,28 @@ def test_json_nested_too_deeply_is_refused_and_not_a_traceback(tmp_path):
     result = nerfcli("convert", tmp_path / "reconstruction.json", tmp_path / "out", "--to", "transforms")
     assert result.exit_code == BAD_INPUT
     assert "not valid JSON" in error_of(result)[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "said"),
+    [
+        ("clip.mp4", ("--masks", "nowhere"), "the mask folder {0}/nowhere does not exist"),
+        ("clip.mp4", ("-o", "."), "cannot write the scene .: the folder contains other files"),
+        pytest.param(
+            *(os.fsdecode(b"caf\xe9.mp4"), (), "the name 'caf\\udce9-frames' is not in UTF-8"),
+            marks=pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such names"),
+        ),
+        ("photos.zip", ("--masks", "nowhere"), "the mask folder {0}/nowhere does not exist"),
+    ],
+)
+def test_poses_neither_reads_a_video_nor_unpacks_photos_for_a_scene_that_is_refused(
+    name, options, said, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    Path(name).write_bytes(b"x")
+    result = nerfcli("poses", name, *options)
+    assert (result.exit_code, error_of(result)[0]) == (BAD_INPUT, f"Error: {said.format(tmp_path)}")
+    assert list(tmp_path.iterdir()) == [tmp_path / name]
 
 
 def test_doctor_refuses_a_run(finished):

@@ -145,12 +145,17 @@ def test_photos_without_a_mask_are_named(photos, masks, tmp_path):
     assert white == [255, 255, 0, 255]
 
 
-def test_a_folder_without_masks_is_reported(photos, masks, tmp_path):
+def test_a_folder_without_masks_is_reported_before_the_work(photos, masks):
+    """In a dry run, too."""
+
+    def plan(folder: Path) -> None:
+        plan_poses(photos.folder, settings=PoseSettings(masks=str(folder)), progress=lambda *reported: None)
+
     with pytest.raises(UserError, match="contains no mask for any photo") as error:
-        laid_out(photos, masks, tmp_path / "work")
+        plan(masks)
     assert "p 0.png.png or p 0.png" in error.value.hint
     with pytest.raises(UserError, match="contains photos, such as"):
-        laid_out(photos, photos.folder, tmp_path / "work")
+        plan(photos.folder)
 
 
 def test_a_folder_that_does_not_exist_is_refused_before_photos_are_read(photos, tmp_path):

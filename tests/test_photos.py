@@ -60,7 +60,7 @@ def test_photos_are_sorted_and_upright(folder: Path):
 @pytest.mark.parametrize("read", [find_photos, find_subject])
 def test_a_name_that_is_not_text_is_refused_before_the_work(folder: Path, read: Callable[[Path], object]):
     (folder / "c.jpg").rename(folder / os.fsdecode(b"caf\xe9.jpg"))
-    with pytest.raises(UserError, match=r"the name 'photos/caf\\udce9.jpg' is not in UTF-8"):
+    with pytest.raises(UserError, match=r"the name 'caf\\udce9.jpg' is not in UTF-8"):
         read(folder)
 
 

@@ -21,7 +21,7 @@ from nerfcli.poses.engine.strict import move_held_out_last
 from nerfcli.poses.engine.supervise import WorkerDiedError, run_worker
 from nerfcli.poses.engine.turntable import MASKS, add_advice
 from nerfcli.poses.input.job import Job, write_job
-from nerfcli.poses.input.layout import lay_out_masks, lay_out_photos
+from nerfcli.poses.input.layout import find_masks, lay_out_masks, lay_out_photos
 from nerfcli.poses.input.pairs import Pairing, choose_pairs, read_pairs
 from nerfcli.poses.input.photos import Photos, find_photos
 from nerfcli.poses.input.plan import Plan, make_plan
@@ -119,6 +119,8 @@ def plan_poses(
     check_settings(settings)
     photos = find_photos(photos_dir, lambda done, total: progress("read", done, total), subfolders=settings.subfolders)
     names_held_out(settings.holdout, photos.names, others=photos.unreadable)  # before the work rather than after it
+    if settings.masks is not None:
+        find_masks(photos, Path(settings.masks))
     grouped = group_photos(photos, model=settings.camera_model) if given is None else group_by_given(photos, given)
     if settings.pairs_file is None:
         pairing = choose_pairs(photos.photos, rule=settings.pairing)

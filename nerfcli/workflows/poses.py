@@ -11,11 +11,12 @@ from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
 from nerfcli.output import Output
 from nerfcli.poses import structure_from_motion
+from nerfcli.poses.input.photos import refuse_odd_names
 from nerfcli.poses.input.plan import STAGES, Plan, TimeEstimate
-from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.poses.input.settings import PoseSettings, check_settings
 from nerfcli.poses.input.video_frames import extract_frames, frames_folder
 from nerfcli.poses.structure_from_motion import photo_notes, plan_poses
-from nerfcli.poses.workspace import is_same_scene
+from nerfcli.poses.workspace import check_destination, is_same_scene
 
 
 def estimate_poses(
@@ -54,12 +55,15 @@ def estimate_poses(
     """
     source = Path(photos)
     target = output.beside(without_suffix(source), "-scene")
-    folder = source
+    folder = frames_folder(target) if source.is_file() else source
+    if source.is_file() and not (target / SCENE_FILE).exists():  # before its files or frames are written
+        check_settings(settings)
+        check_destination(target, folder, subfolders=settings.subfolders)
     if is_archive(source):
         files = unpacked(source, Output(target, output.overwrite), reporter=reporter)
         folder = photo_folder(files) or files
     elif source.is_file():
-        folder = frames_folder(target)
+        refuse_odd_names(folder, ())
         with reporter.stage(f"extract frames of {source.name}") as stage:
             extract_frames(
                 source,

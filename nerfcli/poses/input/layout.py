@@ -94,15 +94,9 @@ def lay_out_masks(
     `files` are the photos' names below the worker's folder of photos, `masks` is the user's folder.
 
     Raises:
-        UserError: no mask in it for any photo, or masks that cannot be read or do not fit.
+        UserError: as for `find_masks`, or masks that cannot be read or do not fit.
     """
-    _check_folder(photos, masks)
-    found = [find_mask(name, masks) for name in photos.names]
-    if not any(found):
-        raise UserError(
-            f"{masks} contains no mask for any photo of {photos.folder}",
-            f"name them after the photos: {photos.names[0]}.png or {Path(photos.names[0]).stem}.png",
-        )
+    found = find_masks(photos, masks)
     folder.mkdir(parents=True, exist_ok=True)
 
     def one(index: int) -> WorkMask | str:
@@ -143,7 +137,12 @@ def write_no_mask(path: Path, size: tuple[int, int]) -> WorkMask:
     return WorkMask()
 
 
-def _check_folder(photos: Photos, masks: Path) -> None:
+def find_masks(photos: Photos, masks: Path) -> list[Path | None]:
+    """Find the mask of each photo in the user's folder.
+
+    Raises:
+        UserError: no mask in it for any photo, or the photos themselves.
+    """
     folder = photos.folder.resolve()
     inside = [name for name in photos.names if (folder / name).is_relative_to(masks.resolve())]
     if inside and masks.resolve().is_relative_to(folder):  # a folder above that of the photos may have the masks
@@ -151,3 +150,10 @@ def _check_folder(photos: Photos, masks: Path) -> None:
             f"{masks} contains photos, such as {inside[0]}",
             "put the masks into a separate folder, outside of that of the photos",
         )
+    found = [find_mask(name, masks) for name in photos.names]
+    if not any(found):
+        raise UserError(
+            f"{masks} contains no mask for any photo of {photos.folder}",
+            f"name them after the photos: {photos.names[0]}.png or {Path(photos.names[0]).stem}.png",
+        )
+    return found

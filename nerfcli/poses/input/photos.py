@@ -92,12 +92,12 @@ def find_photos(
 
 
 def refuse_odd_names(folder: Path, paths: Iterable[Path]) -> None:
-    """Refuse photos of a folder whose name, or its own, is not text: no report, scene or page could hold it.
+    """Refuse photos of a folder whose name, or its own, is not text: neither pages nor models of COLMAP can hold it.
 
     Raises:
         UserError: a name has bytes that are not UTF-8, for which Python has the stand-ins that are searched for here.
     """
-    for name in (f"{folder.absolute().name}/{name_in(folder, path)}" for path in paths):
+    for name in (folder.absolute().name, *(name_in(folder, path) for path in paths)):
         if re.search("[\udc80-\udcff]", name):
             raise UserError(f"the name {name!r} is not in UTF-8", "rename it; old archives have such names")
 
