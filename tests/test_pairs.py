@@ -117,11 +117,23 @@ def test_photos_closer_than_the_error_of_gps_are_not_compared_by_it():
     assert choose_pairs(grid(spacing_deg=0.00001)).rule == "retrieval"
 
 
+@pytest.mark.parametrize("rule", ["auto", "spatial"])
+def test_a_photo_without_a_position_is_left_to_look_alikes(rule):
+    """The pairs of the others, by number, are those without it."""
+    photos = grid(spacing_deg=0.0002)
+    rest = choose_pairs([*photos[:7], *photos[8:]])
+    photos[7] = replace(photos[7], exif=NO_EXIF)
+    pairing = choose_pairs(photos, rule=rule)
+    assert pairing.rule == rest.rule == "spatial"
+    assert set(pairing.pairs) == {(i + (i >= 7), j + (j >= 7)) for i, j in rest.pairs}
+
+
 def test_spatial_pairing_asks_for_positions():
     photos = grid(spacing_deg=0.0002)
-    photos[7] = replace(photos[7], exif=NO_EXIF)
-    with pytest.raises(UserError, match=r"1 of 100 photos have no GPS position \(ha.jpg\)"):
+    photos[7:18] = [replace(photo, exif=NO_EXIF) for photo in photos[7:18]]
+    with pytest.raises(UserError, match=r"11 of 100 photos have no GPS position \(ha.jpg\)"):
         choose_pairs(photos, rule="spatial")
+    assert choose_pairs(photos).rule != "spatial"
 
 
 # Pairs that the user lists

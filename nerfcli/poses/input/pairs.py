@@ -29,6 +29,9 @@ _LOOP_NEIGHBOURS = 8
 _NEIGHBOURS = 25
 # A phone's GPS cannot tell apart neighbours that are all nearer than this.
 _GPS_ERROR_METRES = 10.0
+# GPS is used if this fraction of the photos has positions: the first ones of a phone may have none yet. The others are
+# compared with look-alikes alone.
+_LEAST_LOCATED = 0.9
 # Largest median time from one photo to the next for which the order in time is an order in space.
 _WALKING_PACE_SECONDS = 30.0
 
@@ -55,7 +58,7 @@ def choose_pairs(photos: Sequence[Photo], *, rule: str = "auto") -> Pairing:
 
     Raises:
         ValueError: no such rule.
-        UserError: "spatial" is requested, and a photo has no GPS position.
+        UserError: "spatial" is requested, and too many photos have no GPS position.
     """
     if rule == "auto":
         rule = _best_rule(photos)
@@ -66,15 +69,23 @@ def choose_pairs(photos: Sequence[Photo], *, rule: str = "auto") -> Pairing:
     if rule == "retrieval":
         return Pairing("retrieval", all_pairs(len(photos)) if len(photos) <= ALL_ALIKE_UP_TO else (), _NEIGHBOURS)
     if rule == "spatial":
-        return Pairing("spatial", nearest_pairs(_positions(photos), _NEAREST), _LOOP_NEIGHBOURS)
+        located = _located(photos)
+        if not located:
+            without = [photo.name for photo in photos if photo.exif.gps is None]
+            raise UserError(
+                f"--pairing spatial: {len(without)} of {len(photos)} photos have no GPS position ({without[0]})",
+                "choose --pairing retrieval or auto",
+            )
+        near = nearest_pairs(_positions(photos, located), _NEAREST)
+        return Pairing("spatial", in_blocks((located[i], located[j]) for i, j in near), _LOOP_NEIGHBOURS)
     raise ValueError(f"pairing must be one of {', '.join(PAIRINGS)}, got {rule}")
 
 
 def _best_rule(photos: Sequence[Photo]) -> str:
     if len(photos) <= ALL_ALIKE_UP_TO:
         return "retrieval"
-    if all(photo.exif.gps for photo in photos):
-        places = _positions(photos)
+    if located := _located(photos):
+        places = _positions(photos, located)
         radii = np.sort(np.linalg.norm(places[:, None] - places[None], axis=-1), axis=1)[:, _NEAREST]
         if np.median(radii) > _GPS_ERROR_METRES:
             return "spatial"
@@ -217,15 +228,15 @@ def _unknown(line: str, photo_names: Container[str]) -> str:
     return f"there is no photo {cuts[0][0]!r}" if len(cuts) == 1 else f"{line!r} does not contain two names of photos"
 
 
-def _positions(photos: Sequence[Photo]) -> np.ndarray:
+def _located(photos: Sequence[Photo]) -> list[int]:
+    """Return the numbers of the photos that have a GPS position; none if too many have none."""
+    located = [number for number, photo in enumerate(photos) if photo.exif.gps is not None]
+    return located if len(located) >= _LEAST_LOCATED * len(photos) else []
+
+
+def _positions(photos: Sequence[Photo], located: Sequence[int]) -> np.ndarray:
     """Return positions (N, 2), metres east and north. Heights are left out, since GPS measures them worst."""
-    places = [photo.exif.gps for photo in photos]
-    without = [photo.name for photo in photos if photo.exif.gps is None]
-    if without:
-        raise UserError(
-            f"--pairing spatial: {len(without)} of {len(photos)} photos have no GPS position ({without[0]})",
-            "choose --pairing retrieval or auto",
-        )
+    places = [photos[number].exif.gps for number in located]
     return east_north_up([(*place[:2], None) for place in places if place is not None])[:, :2]
 
 
