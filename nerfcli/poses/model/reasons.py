@@ -11,6 +11,7 @@ FEW_MATCHES = 30
 MIN_MATCHES = 15
 # A held-out photo is placed with the lens that the training photos of its camera gave.
 NO_TRAINING_PHOTO = "its camera took no training photo"
+# Not a cause, so that `dominant` does not count it: the training photos have their reasons.
 NO_MODEL = "held out, and no training photo registered"
 
 
@@ -43,13 +44,12 @@ _ADVICE = {
     "connected to the rest only through": "take photos with more overlap around that photo",
     "matches too few points": "hold out photos that overlap with training photos, see --holdout",
     NO_TRAINING_PHOTO: "hold out only photos of cameras that also took training photos, see --holdout",
-    NO_MODEL: "hold out fewer photos, see --holdout, or take photos with more overlap",
     "rejected by the mapper": "take photos with more overlap and while moving sideways, or try --quality best",
 }
 
 
 def dominant(reasons: Iterable[str]) -> tuple[str, str]:
-    """Return the most frequent kind of reason, and advice.
+    """Return the most frequent kind of reason that explains something by itself, and advice.
 
     Raises:
         ValueError: no reason, or none that this module or `photos` gave.
