@@ -1,6 +1,8 @@
 """poses --strict on the room corner, whose poses are known: held-out photos change nothing, and are placed rightly."""
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +35,14 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, PoseSe
     write_capture(folder / "photos")
     (folder / "test.txt").write_text(f"{NAMES[HELD_OUT]}\nwall.png\n")
     settings = replace(FAST, max_features=300, max_image_size=320, strict=True, holdout=str(folder / "test.txt"))
+    with training_model_kept(folder):
+        report = poses_in_this_process(folder / "photos", folder / "scene", settings)
+    return folder / "photos", folder / "scene", settings, report
+
+
+@contextmanager
+def training_model_kept(folder: Path) -> Iterator[None]:
+    """Copy the model of the training photos to a folder before held-out ones are placed."""
 
     def place_after_copying(job: Job, *others: Any) -> dict[str, Any]:
         shutil.copytree(Path(job.folder) / "sparse" / "0", folder / "training model")
@@ -40,8 +50,19 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, PoseSe
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(worker, "place_held_out", place_after_copying)
-        report = poses_in_this_process(folder / "photos", folder / "scene", settings)
-    return folder / "photos", folder / "scene", settings, report
+        yield
+
+
+def assert_added(folder: Path, name: str) -> set[str]:
+    """Assert that a scene has nothing but a photo more than its training model; return what that has brought."""
+    model = pycolmap.Reconstruction(str(folder / "scene" / "sparse" / "0"))
+    before, after = bits(pycolmap.Reconstruction(str(folder / "training model"))), bits(model)
+    assert before.items() <= after.items()
+    photo = model.find_image_with_name(name)
+    numbers = {"pose": photo.image_id, "camera": photo.camera_id}
+    added = after.keys() - before.keys()
+    assert all(number == numbers[kind] for kind, number in added)
+    return {kind for kind, _ in added}
 
 
 def bits(model: pycolmap.Reconstruction) -> dict[tuple[str, int], Any]:
@@ -50,8 +71,14 @@ def bits(model: pycolmap.Reconstruction) -> dict[tuple[str, int], Any]:
         ("point", number): (point.xyz.tobytes(), sorted((e.image_id, e.point2D_idx) for e in point.track.elements))
         for number, point in model.points3D.items()
     }
-    cameras = {("camera", number): camera.params.tobytes() for number, camera in model.cameras.items()}
-    poses = {("pose", i): model.image(i).cam_from_world().matrix().tobytes() for i in model.reg_image_ids()}
+    cameras = {
+        ("camera", number): (camera.model.name, camera.width, camera.height, camera.params.tobytes())
+        for number, camera in model.cameras.items()
+    }
+    poses = {
+        ("pose", i): (image.name, image.camera_id, image.cam_from_world().matrix().tobytes())
+        for i, image in ((i, model.image(i)) for i in model.reg_image_ids())
+    }
     return points | cameras | poses
 
 
@@ -60,9 +87,7 @@ def test_a_held_out_photo_is_placed_and_moves_nothing_by_a_bit(solved):
     photos, scene_dir, _, report = solved
     model = pycolmap.Reconstruction(str(scene_dir / "sparse" / "0"))
     name = NAMES[HELD_OUT]
-    before, after = bits(pycolmap.Reconstruction(str(photos.parent / "training model"))), bits(model)
-    assert after.keys() - before.keys() == {("pose", model.find_image_with_name(name).image_id)}
-    assert before.items() <= after.items()
+    assert assert_added(photos.parent, name) == {"pose"}
     held_out = model.find_image_with_name(name)
     tracks = [element.image_id for point in model.points3D.values() for element in point.track.elements]
     assert held_out.image_id not in tracks

@@ -10,6 +10,7 @@ import synthetic_captures as synthetic
 from corner import NAMES, write_capture
 from in_this_process import poses_in_this_process
 from synthetic_captures import Lens
+from test_pose_strict import assert_added, training_model_kept
 
 from nerfcli.captures.loading import load_scene
 from nerfcli.poses.input.job import Solver
@@ -249,7 +250,8 @@ def stabilised(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarr
     write_capture(folder / "photos", shifts)
     (folder / "test.txt").write_text(f"{NAMES[2]}\n")
     settings = PoseSettings(max_features=600, threads=1, strict=True, holdout=str(folder / "test.txt"))
-    report = poses_in_this_process(folder / "photos", folder / "scene", settings)
+    with training_model_kept(folder):
+        report = poses_in_this_process(folder / "photos", folder / "scene", settings)
     return folder / "scene", shifts, report
 
 
@@ -261,6 +263,7 @@ def test_a_scene_of_stabilised_photos_has_their_principal_points(stabilised):
     assert any("its own principal point" in note for note in closing_notes(report))
     model = pycolmap.Reconstruction(str(scene_dir / "sparse" / "0"))
     assert report.strict is not None
+    assert assert_added(scene_dir.parent, NAMES[2]) == {"pose", "camera"}
     large = [0, 1, 2, 3, 4]  # the others are smaller, of another lens
     cameras = [model.camera(model.find_image_with_name(NAMES[number]).camera_id) for number in large]
     assert len({camera.camera_id for camera in cameras}) == len(large)
