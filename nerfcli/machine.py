@@ -95,7 +95,8 @@ def thread_count(threads: int) -> int:
         return threads
     # Not every system has sched_getaffinity.
     processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    for text in _limits_of_groups("cpu.max"):
+    version_1 = (_limits_of_groups(f"cpu.cfs_{part}_us", "cpu") for part in ("quota", "period"))
+    for text in (*_limits_of_groups("cpu.max"), *map(" ".join, zip(*version_1, strict=True))):
         quota, _, period = text.partition(" ")
         if quota.isdecimal():
             processors = min(processors, math.ceil(int(quota) / int(period)))

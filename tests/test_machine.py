@@ -102,8 +102,19 @@ def test_info_shows_this_machine():
             2_400_000,
         ),
         ("7:memory:/job\n0::/", {"memory/job/memory.limit_in_bytes": "500000"}, None, 400_000),
+        (
+            "4:cpu,cpuacct:/job\n0::/",
+            {
+                "cpu/job/cpu.cfs_quota_us": "150000",
+                "cpu/job/cpu.cfs_period_us": "100000",
+                "cpu/cpu.cfs_quota_us": "-1",
+                "cpu/cpu.cfs_period_us": "100000",
+            },
+            2,
+            None,
+        ),
     ],
-    ids=["none", "container", "slurm", "version 1"],
+    ids=["none", "container", "slurm", "version 1, memory", "version 1, processors"],
 )
 def test_limits_of_containers_and_jobs_count(own, limits, processors, memory, monkeypatch, tmp_path):
     """Regression: only those of containers did; a job with 8 GB of a large machine was killed."""
