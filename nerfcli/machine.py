@@ -201,13 +201,15 @@ def resident_bytes(process: int | None = None) -> int:
 
 def peak_resident_bytes() -> int:
     """Return the largest resident memory of this process since it or `begin_recent_peak` began, in bytes."""
+    if (recent := recent_peak_bytes()) is not None:
+        return recent
     if sys.platform == "win32":
         import psutil
 
         return psutil.Process().memory_info().peak_wset
     import resource
 
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # on Linux, at least that of the process that started it
     return peak if sys.platform == "darwin" else peak * 1024  # kilobytes everywhere else
 
 

@@ -163,6 +163,14 @@ def test_freed_memory_is_used_again_without_page_faults_until_it_is_returned():
     assert _measured("")[0] > 1000  # without it
 
 
+@pytest.mark.skipif(not os.path.exists("/proc/self/clear_refs"), reason="only Linux tells them apart")
+def test_the_peak_of_memory_is_not_that_of_the_process_that_started_this_one():
+    child = "from nerfcli.machine import peak_resident_bytes; print(peak_resident_bytes())"
+    parent = f"import subprocess, sys; kept = b'x' * 2**28; subprocess.run([sys.executable, '-c', {child!r}])"
+    out = subprocess.run([sys.executable, "-c", parent], check=True, stdout=subprocess.PIPE, text=True).stdout
+    assert int(out) < 2**27
+
+
 def _no_library(name: None) -> object:
     raise TypeError("LoadLibrary() argument 1 must be str, not None")
 
