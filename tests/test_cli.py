@@ -41,6 +41,7 @@ from nerfcli.output import Output
 from nerfcli.photos.images import read_image
 from nerfcli.photos.masks import write_masks
 from nerfcli.poses import structure_from_motion
+from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.files.float_maps import read_tiff
 from nerfcli.training import loop
@@ -817,11 +818,34 @@ def test_run_holds_out_what_is_asked_of_a_capture_and_refuses_options_of_poses(m
     monkeypatch.setattr("nerfcli.workflows.pipeline.train_scene", only_asked)
     for more in ((), ("--holdout", "block:0.15"), ("--holdout", "every:8")):
         nerfcli("run", capture, *more)
-    assert rules == [None, "block:0.15", "every:8"]  # regression: what is usual without poses was ignored
+    for poses, holdout in (
+        (PoseSettings(holdout="block:0.15"), None),
+        (PoseSettings(), "every:8"),
+        (PoseSettings(), None),
+    ):
+        with pytest.raises(UserError, match="enough"):
+            pipeline.run_pipeline(capture, poses=poses, holdout=holdout)
+    # Regression: what is usual without poses was ignored, and from Python what `poses` says.
+    assert rules == [None, "block:0.15", "every:8", "block:0.15", "every:8", None]
     for more in (("--frames", "9"), ("--quality", "best"), ("--subfolders",)):
         refused = nerfcli("run", capture, *more)
         assert refused.exit_code == 2
         assert "has poses, which are used" in error_of(refused)[0]
+
+
+def test_run_holds_out_what_is_asked_of_photos(monkeypatch, capture):
+    rules = []
+
+    def only_asked(photos: Path, output: Output, poses: PoseSettings, **more: object) -> None:
+        rules.append(poses.holdout)
+        raise UserError("enough", "of this test")
+
+    monkeypatch.setattr(pipeline, "estimate_poses", only_asked)
+    in_poses = PoseSettings(holdout="block:0.15")
+    for settings_of_poses, holdout in ((in_poses, None), (in_poses, "block:0.2"), (PoseSettings(), None)):
+        with pytest.raises(UserError, match="enough"):
+            pipeline.run_pipeline(capture / "train", poses=settings_of_poses, holdout=holdout)
+    assert rules == ["block:0.15", "block:0.2", "every:8"]
 
 
 def test_run_makes_no_splats_of_panoramas(monkeypatch, capture, tmp_path):

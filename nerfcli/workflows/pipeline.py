@@ -76,7 +76,7 @@ def run_pipeline(
             budget of the training.
         frames: number of frames to use from a video; None for 120.
         intrinsics: file with intrinsics of the cameras, which are kept; None to estimate them.
-        holdout: photos of a capture with poses to hold out, as for `train_scene`; of others, `poses` says which.
+        holdout: photos to hold out, as for `train_scene`; None for what `poses` says.
         resources: threads, device and memory of all stages.
         reporter: receives messages, stage by stage.
         show: called with each result as soon as it is complete.
@@ -87,13 +87,15 @@ def run_pipeline(
     settings, again = training or TrainSettings(model="auto"), output.overwrite
     settings = replace(settings, threads=resources.cores, device=resources.torch_device)
     scene_output = Output(None if output.path is None else Path(output.path) / "scene", again)
+    if holdout is None and poses.holdout != PoseSettings.holdout:
+        holdout = poses.holdout
     capture = _capture_of(Path(photos), scene_output, reporter)
     if capture is not None:
         _refuse_unused(Path(photos), poses, frames=frames, intrinsics=intrinsics)
     scene = capture or estimate_poses(
         photos,
         scene_output,
-        replace(poses, threads=resources.cores),
+        replace(poses, threads=resources.cores, holdout=holdout or poses.holdout),
         frames=frames,
         intrinsics=intrinsics,
         resources=resources,
