@@ -148,7 +148,7 @@ class _Results:
 
     def metrics(self) -> Evaluation:
         """Evaluate the field."""
-        output = self._replacing(self.run.metrics_path, "checkpoint_sha256", self.run.checkpoint_sha256())
+        output = self._replacing(self.run.metrics_path, {"checkpoint_sha256": self.run.checkpoint_sha256()})
         with self.reporter.stage("evaluate") as stage:
             evaluation = evaluate_run(self.run.path, output, resources=self.resources, reporter=stage)
         self.show(evaluation)
@@ -162,7 +162,7 @@ class _Results:
             output = Output(overwrite=self.again or is_old)
             with self.reporter.stage("export splats") as stage:
                 export_run(run, output, to="splats", splats=settings, resources=self.resources, reporter=stage)
-        output = self._replacing(run / f"metrics-{splats.name}.json", "checkpoint_sha256", file_digest(splats))
+        output = self._replacing(run / f"metrics-{splats.name}.json", {"checkpoint_sha256": file_digest(splats)})
         with self.reporter.stage("evaluate splats") as stage:
             evaluation = evaluate_splats(run, splats, output, resources=self.resources, reporter=stage)
         self.show(evaluation)
@@ -172,9 +172,10 @@ class _Results:
     def pictures(self, views: Views, settings: RenderSettings, *, splats: Path | None = None) -> list[Path]:
         """Render views of the splats, or else of the field."""
         run, name = self.run.path, folder_name(views, settings, of_splats=splats is not None)
-        key = "field_sha256" if splats is None else "splats_sha256"
-        made_from = self.run.checkpoint_sha256() if splats is None else file_digest(splats)
-        output = self._replacing(run / RENDERS / name / DESCRIPTION, key, made_from)
+        made_from = {"field_sha256": self.run.checkpoint_sha256()}
+        if splats is not None:
+            made_from["splats_sha256"] = file_digest(splats)
+        output = self._replacing(run / RENDERS / name / DESCRIPTION, made_from)
         what = {"views": views, "settings": settings, "splats": splats}
         with self.reporter.stage(f"render {views.name}") as stage:
             written = render_run(run, output, **what, resources=self.resources, reporter=stage)
@@ -190,13 +191,13 @@ class _Results:
         self.show(report)
         return report
 
-    def _replacing(self, file: Path, key: str, made_from: str | None) -> Output:
+    def _replacing(self, file: Path, made_from: dict[str, str]) -> Output:
         """Return the output of a result that a JSON file describes: one made from something else is replaced."""
-        made = None
+        is_old = False
         if file.is_file():
             with suppress(UserError):
-                made = read_json(file, needed=(key,), hint="")[key]
-        return Output(overwrite=self.again or made not in (None, made_from))
+                is_old = not made_from.items() <= read_json(file, needed=tuple(made_from), hint="").items()
+        return Output(overwrite=self.again or is_old)
 
 
 def _refuse_unused(photos: Path, poses: PoseSettings, *, frames: int | None, intrinsics: Path | None) -> None:
