@@ -102,7 +102,7 @@ def test_a_panorama_shows_the_surfaces_all_around():
     shell = foggy_cells((-0.8, -0.8, -0.8), (0.8, 0.8, 0.8)) & ~foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     model, pose = replace(block(), occupied=shell), np.eye(4)
     pose[:3, 3] = SIMILARITY.inverse().apply(np.array([0.1, -0.2, 0.0]))
-    views = depth_views(model, [Frame("a.jpg", equirectangular(128, 64), pose)], max_size=24)
+    views = depth_views(model, [Frame("a.jpg", equirectangular(128, 64), pose)], max_size=48)
     assert all(np.isfinite(view.depth).all() and max(view.frame.camera.size) == 24 for view in views)
     points = model.training_from_scene.apply(np.concatenate([view.points().reshape(-1, 3) for view in views]))
     np.testing.assert_allclose(np.abs(points).max(axis=1), 0.5, atol=0.02)  # on the walls, all six of them

@@ -88,14 +88,17 @@ def depth_views(
 
 
 def _small_pinholes(frame: Frame, max_size: int) -> list[Frame]:
-    """Return frames of pinhole cameras that see what a frame sees, their longer sides at most `max_size` pixels."""
+    """Return frames of pinhole cameras that see what a frame sees, their longer sides at most `max_size` pixels.
+
+    The six faces of a panorama have half of this size, because their pixels are kept in memory, too.
+    """
     camera, pose = frame.camera, frame.world_from_cam
     if not camera.is_spherical:
         factor = max(1.0, max(camera.size) / max_size)
         pinhole = pinhole_of(camera)
         small = pinhole.resized(max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
         return [replace(frame, camera=small)]
-    side = max(1, min(camera.width // 4, max_size))
+    side = max(1, min(camera.width // 4, max_size // 2))
     face = Camera.pinhole(side, side, side / 2)  # 90 degrees
     poses = [from_parts(pose[:3, :3] @ turn, pose[:3, 3]) for turn in _TURNS]
     return [replace(frame, camera=face, world_from_cam=turned) for turned in poses]
