@@ -336,6 +336,16 @@ def test_a_video_says_what_it_shows(model, tmp_path):
         assert reported["nerfcli"] == description["nerfcli"]
 
 
+def test_a_video_names_a_run_whose_name_is_not_utf_8(model, tmp_path):
+    """Regression: the gif ended in an error of encoding after all pictures."""
+    job = replace(job_of(2, video=replace(VIDEO, formats=("mp4", "gif"))), provenance={"run": "caf\udce9"})
+    render(model, job, tmp_path / "views")
+    for name in ("depth.mp4", "depth.gif"):
+        reported = description_of(tmp_path / "views" / name)
+        assert reported is not None
+        assert reported["run"] == "caf\udce9"
+
+
 def test_a_video_gets_the_pictures_of_its_output_in_order(model, tmp_path, monkeypatch):
     seen: dict[str, list[np.ndarray]] = {}
 

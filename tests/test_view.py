@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import re
 import shlex
 import signal
@@ -405,6 +406,15 @@ def fit(run: Path, *, on_step: Any = lambda progress: None) -> None:
     loop.train(
         load_scene(run.with_name("spheres")), run, FEW, resume=False, notify=lambda text: None, on_progress=on_step
     )
+
+
+def test_the_page_waits_for_a_field_in_a_folder_whose_name_is_not_utf_8(tmp_path):
+    """Regression: the answer was an error of encoding, after which browsers do not try again."""
+    run = tmp_path / os.fsdecode(b"caf\xe9-run")
+    with closing(Served(run)) as served:
+        status, text = served.refusal("")
+        assert (status, text.split(":")[0]) == (503, f"{tmp_path}/caf\\udce9-run has no field yet")
+        assert served.refusal("field")[0] == 503
 
 
 def test_each_checkpoint_is_a_new_version_and_viewers_change_nothing(capture, monkeypatch):

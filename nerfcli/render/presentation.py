@@ -231,6 +231,8 @@ def write_videos(
             path = folder / f"{output}.{form}"
             notify(f"encoding {path.name}, {len(job.names)} frames")
             comment = json.dumps(_comment(job, meta, output, ranges), ensure_ascii=False)
+            # Names that are not UTF-8, as in `atomic.write_json`.
+            comment = comment.encode(errors="backslashreplace").decode()
             write_video(path, pictures, fps=settings.fps, comment=comment)
 
 

@@ -129,7 +129,7 @@ class _Handler(BaseHTTPRequestHandler):
         _, token, place = (address.path + "//").split("/", 3)[:3]
         if not hmac.compare_digest(token.encode(), self._of.token.encode()):
             self._send(
-                HTTPStatus.FORBIDDEN, "text/plain", b"wrong token: open the complete address that nerfcli wrote\n"
+                HTTPStatus.FORBIDDEN, "text/plain", "wrong token: open the complete address that nerfcli wrote\n"
             )
             return
         self._query = {name: values[-1] for name, values in parse_qs(address.query).items()}
@@ -137,28 +137,28 @@ class _Handler(BaseHTTPRequestHandler):
         if self.command == "GET" and place == "photo":
             handle = self._photo
         if handle is None:
-            self._send(HTTPStatus.NOT_FOUND, "text/plain", b"there is nothing here\n")
+            self._send(HTTPStatus.NOT_FOUND, "text/plain", "there is nothing here\n")
             return
         try:
             handle()
         except UserError as error:
-            self._send(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", f"{error.message}: {error.hint}".encode())
+            self._send(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", f"{error.message}: {error.hint}")
         except ValueError as error:
-            self._send(HTTPStatus.BAD_REQUEST, "text/plain", str(error).encode())
+            self._send(HTTPStatus.BAD_REQUEST, "text/plain", str(error))
         except LookupError:
-            self._send(HTTPStatus.NOT_FOUND, "text/plain", b"there is nothing here\n")
+            self._send(HTTPStatus.NOT_FOUND, "text/plain", "there is nothing here\n")
 
     def _page(self) -> None:
         try:
             text = self._of.show.page()
         except UserError as error:  # a training may write its field soon
             text = f"{error.message}: {error.hint}\n"
-            self._send(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain; charset=utf-8", text.encode(), {"Refresh": "2"})
+            self._send(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain; charset=utf-8", text, {"Refresh": "2"})
             return
-        self._send(HTTPStatus.OK, "text/html; charset=utf-8", text.encode(errors="backslashreplace"))
+        self._send(HTTPStatus.OK, "text/html; charset=utf-8", text)
 
     def _version(self) -> None:
-        self._send(HTTPStatus.OK, "application/json", json.dumps(self._of.show.version()).encode())
+        self._send(HTTPStatus.OK, "application/json", json.dumps(self._of.show.version()))
 
     def _field(self) -> None:
         self._send(HTTPStatus.OK, "application/octet-stream", self._of.show.field())
@@ -198,7 +198,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
         self.end_headers()
 
-    def _send(self, status: HTTPStatus, kind: str, content: bytes, more: dict[str, str] | None = None) -> None:
+    def _send(self, status: HTTPStatus, kind: str, content: str | bytes, more: dict[str, str] | None = None) -> None:
+        if isinstance(content, str):
+            content = content.encode(errors="backslashreplace")  # names of files may be no UTF-8
         self._begin(kind, status, {"Content-Length": str(len(content)), **(more or {})})
         self.wfile.write(content)
 
