@@ -187,6 +187,18 @@ def test_another_job_takes_nothing_from_it_and_leaves_it(model, tmp_path):
     assert left.items() <= contents(tmp_path).items()
 
 
+def test_a_disk_that_cannot_be_replaced_is_refused_before_rendering(model, tmp_path, monkeypatch):
+    """Regression: the pictures were collected beside it, on another disk, and could not be moved in the end."""
+    disk, link = tmp_path / "disk", tmp_path / "views"
+    disk.mkdir()
+    link.symlink_to(disk)
+    monkeypatch.setattr("os.path.ismount", lambda path: path == disk)
+    for folder in (disk, link):
+        with pytest.raises(UserError, match=f"{folder} is a mounted disk"):
+            render(model, job_of(), folder, on_frames=stop_after(-1, AssertionError("a picture was rendered")))
+    assert set(tmp_path.iterdir()) == {disk, link}
+
+
 def test_a_job_that_is_stopped_leaves_the_old_folder(model, tmp_path):
     render(model, job_of(2), tmp_path / "views")
     old = contents(tmp_path / "views")

@@ -12,6 +12,7 @@ moment, or several that rendered parts of the frames, the next one renders only 
 """
 
 import json
+import os
 import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +25,7 @@ import numpy as np
 import torch
 
 from nerfcli.atomic import cannot_write, clear_leftovers, exclusive, replace_folder, write_json
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, in_shell
 from nerfcli.field.background import Background, SphereBackground
 from nerfcli.machine import use_threads
 from nerfcli.notices import Reporter
@@ -87,9 +88,14 @@ def render_job(
     unfinished = _Unfinished(place.with_name(f".{folder.name}.unfinished-{job.digest}"))
     if job.is_kept_in(folder, output):
         reporter.note(f"{folder} is kept: it is complete and has these settings; add --overwrite to render again")
-        clear_leftovers(folder.parent)
+        clear_leftovers(place.parent)
         unfinished.discard()
         return job.results(folder)
+    if os.path.ismount(place):
+        raise UserError(
+            f"{folder} is a mounted disk, which no folder can replace",
+            f"choose a folder in it: -o {in_shell(folder / 'renders')}",
+        )
     job.check()
     unfinished.create(folder)
     if part is not None:
