@@ -20,7 +20,7 @@ from nerfcli.evaluate.depth_errors import measure_depth_errors
 from nerfcli.notices import Notify, Reporter
 from nerfcli.photos.masks import read_mask
 from nerfcli.render.coverage import MAX_SIZE, STEEPEST_DEG, DepthMap, depth_maps, small_frame
-from nerfcli.render.depth_errors import STRATA, DepthErrors
+from nerfcli.render.depth_errors import LEAST_PHOTOS, LEAST_PIXELS, STRATA, DepthErrors
 from nerfcli.render.model import Model
 from nerfcli.training.runs.files import DEPTH_ERRORS, PHOTO_DEPTHS
 from nerfcli.training.runs.run import Run
@@ -78,7 +78,10 @@ def depth_errors(run: Run, model: Model, photos: Sequence[DepthMap], *, reporter
     for least, pixels, quantiles in zip(STRATA, errors.pixels, errors.quantiles, strict=True):
         if np.isnan(quantiles).any():
             seen = several(least, "photo sees", "photos see")
-            reporter.note(f"no intervals or confidence where {seen} the surface: only {pixels} pixels were measured")
+            reporter.note(
+                f"no intervals or confidence where {seen} the surface: {pixels} pixels were measured, "
+                f"and {LEAST_PIXELS} are needed, in {LEAST_PHOTOS} held-out photos"
+            )
     reporter.note(
         f"errors of depth measured at {100.0 * errors.matched:.1f} % of the pixels of {errors.photos} held-out photos"
     )
