@@ -5,7 +5,7 @@ import json
 import math
 
 import pytest
-from commands import listing
+from commands import error_of, listing, nerfcli
 from conftest import SPHERES
 from typer.testing import CliRunner
 
@@ -122,6 +122,17 @@ def test_something_else_is_left_alone(tmp_path):
     assert done.exit_code == 3
     assert "is not an ablation" in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize("command", ["ablate", "bench"])
+def test_a_scene_without_held_out_photos_is_refused_with_the_file_that_names_them(command, capture):
+    scene = capture.with_name("scene")
+    assert nerfcli("convert", capture, scene, "--to", "nerfcli").exit_code == 0
+    content = json.loads((scene / "scene.json").read_text())
+    (scene / "scene.json").write_text(json.dumps(content | {"split": {"test": []}}))
+    error, hint = error_of(nerfcli(command, scene))
+    assert error == f"Error: {scene} has no held-out photos"
+    assert f'name some in {scene / "scene.json"}, such as every 8th: "split": {{"test": [' in hint
 
 
 def test_wrong_names_are_usage_errors(tmp_path):

@@ -23,6 +23,7 @@ import torch
 from nerfcli import machine
 from nerfcli.bench.results import Point, spread
 from nerfcli.captures.capture import Capture
+from nerfcli.captures.loading import refuse_without_held_out_photos
 from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import compare
 from nerfcli.evaluate.photos import HeldOutPhoto, background_of, held_out_photos, paired
@@ -273,10 +274,7 @@ def measure_trainings(
     Raises:
         UserError: see `nerfcli.training.loop.train`; or nothing was held out.
     """
-    if not scene.test_frames:
-        raise UserError(
-            f"{scene.root} has no held-out photos", "its split lists none: name some, such as every 8th photo"
-        )
+    refuse_without_held_out_photos(scene)
     device = resources.torch_device
     base = TrainSettings(device=device, threads=resources.cores)
     chosen, unit = affordable(train_settings(), seconds, overhead=6.0)

@@ -15,6 +15,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import run_cameras
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.registry import recognise
+from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.captures.holdout import HELD_OUT_EVERY, default_split, names_held_out
 from nerfcli.captures.orientation import UPRIGHT, counted, measure_of, rescaling, upright
 from nerfcli.errors import UserError, in_shell
@@ -148,6 +149,20 @@ def refuse_without_training_photos(scene: Capture) -> None:
         if len(scene.frames) < 2:
             hint = f"every {HELD_OUT_EVERY}th photo is held out, so at least 2 are needed"
         raise UserError(f"{scene.root} has no training photo", hint)
+
+
+def refuse_without_held_out_photos(scene: Capture) -> None:
+    """Refuse a scene whose split holds out no photo.
+
+    Raises:
+        UserError: there is no held-out photo.
+    """
+    if not scene.test_frames:
+        # Of all other formats, a split that lists none is no split.
+        hint = (
+            f'name some in {scene.root / SCENE_FILE}, such as every {HELD_OUT_EVERY}th: "split": {{"test": ["a.jpg"]}}'
+        )
+        raise UserError(f"{scene.root} has no held-out photos", hint)
 
 
 def describe_unused_masks(scene: Capture) -> str | None:

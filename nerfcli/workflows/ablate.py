@@ -21,8 +21,7 @@ from nerfcli.bench.ablation import (
 )
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import find_model, parse_colmap
-from nerfcli.captures.loading import load_scene
-from nerfcli.errors import UserError
+from nerfcli.captures.loading import load_scene, refuse_without_held_out_photos
 from nerfcli.evaluate.photos import held_out_photos
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.notices import Reporter
@@ -62,8 +61,7 @@ def ablate_scene(
         UserError: see `nerfcli.training.loop.train`; or no photos are held out, or the folder holds something else.
     """
     scene = load_scene(path)
-    if not scene.test_frames:
-        raise UserError(f"{path} has no held-out photos", "its split lists none: name some, such as every 8th photo")
+    refuse_without_held_out_photos(scene)
     folder = output.beside(path, "-ablation")
     about: dict[str, Any] = {"scene": str(path), "settings": settings.to_json()}
     about |= {"seeds": seeds, "varied": list(only or CHOICES)}
