@@ -110,13 +110,11 @@ def evaluate_scan(
     refuse_read_only(path)
     scan = scan_of(result, run)
     geometry = scan.geometry.corrected(result.used["centre"], result.used["tilt"])
-    truth = load_truth(scan.history)
+    truth, air = load_truth(scan.history), held_out_air(scan, geometry, result)
     methods: dict[str, Any] = {}
 
     def measure(name: str, volume: np.ndarray) -> None:
-        projections = score_projections(
-            scan, geometry, torch.from_numpy(np.array(volume)), result.grid, air=held_out_air(scan, geometry, result)
-        )
+        projections = score_projections(scan, geometry, torch.from_numpy(np.array(volume)), result.grid, air=air)
         methods[name] = {
             "projections": None if projections is None else asdict(projections),
             "volume": None if truth is None else asdict(score_volume(volume, result.grid, truth[1], truth[0])),

@@ -67,25 +67,29 @@ def render_scan(
     chosen = np.array(scan.held_out, dtype=int) if views == "test" else scan.training_views
     if len(chosen) == 0:
         raise UserError(f"{run} has no held-out views", "render the training views with --cameras train")
-    corrected = scan.geometry.corrected(result.used["centre"], result.used["tilt"])
-    geometry = corrected.select(chosen)
-    projector, likelihood = Projector(geometry, result.grid), likelihood_of(scan, chosen)
-    air = held_out_air(scan, corrected, result) if views == "test" else result.used.get("air")
-    if air is not None:
-        assert isinstance(likelihood, Poisson)
-        likelihood = likelihood.scaled(torch.as_tensor(air, dtype=torch.float32))
-    volume = torch.from_numpy(np.array(result.volume))
-    top = float(np.nanmax(scan.line_integrals(chosen)))
     paths = {(view, name): target / name / f"{view:04d}.tif" for view in chosen for name in outputs}
     output.refuse_existing(*paths.values())
+    corrected = scan.geometry.corrected(result.used["centre"], result.used["tilt"])
+    geometry = corrected.select(chosen)
+    projector, likelihood = Projector(geometry, result.grid), None
+    if "residual" in outputs:
+        likelihood = likelihood_of(scan, chosen)
+        air = held_out_air(scan, corrected, result) if views == "test" else result.used.get("air")
+        if air is not None:
+            assert isinstance(likelihood, Poisson)
+            likelihood = likelihood.scaled(torch.as_tensor(air, dtype=torch.float32))
+    volume = torch.from_numpy(np.array(result.volume))
+    top = float(np.nanmax(scan.line_integrals(chosen)))
     for number, view in enumerate(chosen):
         index = np.array([number])
         integrals = projector.forward(volume, index)
         pictures = {
             "projection": (integrals, 0.0, top),
             "transmission": (torch.exp(-integrals), 0.0, 1.0),
-            "residual": (residual_of(likelihood, integrals, torch.from_numpy(index)), -RESIDUAL_RANGE, RESIDUAL_RANGE),
         }
+        if likelihood is not None:
+            residual = residual_of(likelihood, integrals, torch.from_numpy(index))
+            pictures["residual"] = (residual, -RESIDUAL_RANGE, RESIDUAL_RANGE)
         for name in outputs:
             values, low, high = pictures[name]
             _write_picture(paths[view, name], values.view(geometry.rows, geometry.columns).numpy(), low, high)
