@@ -251,6 +251,17 @@ def test_an_interrupt_between_fit_and_save_waits(
     assert load_reconstruction(tmp_path / "run").complete
 
 
+def test_a_damaged_run_is_trained_again_as_the_hint_says(bean_run: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(bean_run, tmp_path / "run")
+    (run / "marks.npy").unlink()
+    again = ("train", bean_run.with_name("bean"), "-o", run, "--passes", "1", "--voxel-size", "3", "--centre", "0")
+    code, _, err = call(*again)
+    assert code == 3
+    assert f"Error: {run} cannot be read as a reconstruction" in err
+    assert "Hint:  train the scan again with --overwrite" in err
+    assert call(*again, "--overwrite")[0] == 0
+
+
 def test_a_save_that_fails_leaves_the_earlier_run(bean_run: Path, tmp_path: Path) -> None:
     run = shutil.copytree(bean_run, tmp_path / "run")
     result = load_reconstruction(run)

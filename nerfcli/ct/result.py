@@ -176,7 +176,10 @@ def load_reconstruction(run: Path) -> Reconstruction:
             content["complete"],
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{run} cannot be read as a reconstruction: {error}", "train the scan again") from error
+        raise UserError(
+            f"{run} cannot be read as a reconstruction: {error}",
+            "train the scan again with --overwrite, or into another folder with -o",
+        ) from error
 
 
 def scan_of(result: Reconstruction, run: Path) -> Scan:
