@@ -419,8 +419,8 @@ def test_other_suffixes_and_types_are_refused(tmp_path: Path) -> None:
         (("--voxel-size", "0"), "invalid voxel size 0"),
         (("--voxel-size", "0.001"), "need .* GB of memory"),
         (("--voxel-size", "inf"), "invalid voxel size inf"),
-        (("--centre", "nan"), "invalid --centre nan"),
-        (("--tilt", "inf"), "invalid --tilt inf"),
+        (("--centre", "inf"), "--centre is not a finite number"),
+        (("--tilt", "inf"), "--tilt is not a finite number"),
         (("--centre", "1e9"), "--centre 1e\\+09 is outside the 30 columns"),
     ],
 )
@@ -454,6 +454,11 @@ def test_few_views_and_columns_are_refused_or_checked(tmp_path: Path) -> None:
     code, _, err = call("train", tmp_path / "scan", "--passes", "1")
     assert code == 3
     assert err.startswith(f"Error: {tmp_path / 'scan'} has 2 views that are not held out, expected 3\n")
+    assert "with fewer views held out" in err
+    save_scan(tmp_path / "few", scan_of(cone(2, rows=2, columns=4)))
+    assert (
+        "Hint:  a reconstruction needs more views of the object" in call("train", tmp_path / "few", "--passes", "1")[2]
+    )
     assert not (tmp_path / "scan-run").exists()
     code, out, err = call("doctor", tmp_path / "scan")
     assert (code, out) == (0, f"{tmp_path / 'scan-doctor.html'}\n"), err

@@ -62,7 +62,7 @@ class ReconstructionSettings:
             raise UserError(f"invalid voxel size {self.voxel_size:g}", "give --voxel-size a length above 0")
         for option, value in (("--centre", self.centre), ("--tilt", self.tilt)):
             if value is not None and not math.isfinite(value):
-                raise UserError(f"invalid {option} {value:g}", "give a finite number, or leave it out")
+                raise UserError(f"{option} is not a finite number", "give one, or leave it out")
         if not 0 <= self.strength < math.inf:
             raise UserError(
                 f"invalid weight of total variation: {self.strength:g}",

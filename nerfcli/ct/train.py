@@ -84,9 +84,12 @@ def train_scan(
     run = output.beside(folder, "-run")
     loaded = load_scan(folder)
     if len(loaded.training_views) < LEAST_VIEWS:
+        enough = loaded.geometry.views >= LEAST_VIEWS
         raise UserError(
             f"{folder} has {several(len(loaded.training_views), 'view')} that are not held out, expected {LEAST_VIEWS}",
-            "convert it again, with fewer views held out",
+            "convert it again, with fewer views held out"
+            if enough
+            else "a reconstruction needs more views of the object",
         )
     if settings.centre is not None and abs(settings.centre) > loaded.geometry.columns:
         raise UserError(
