@@ -11,7 +11,7 @@ from ellipsoids import attenuation_of_voxels, bean, line_integrals
 from scipy.ndimage import binary_erosion, gaussian_filter
 
 from nerfcli.ct import reconstruct as reconstruction
-from nerfcli.ct.baselines import filtered_back_projection, filtered_misfit, sart_total_variation
+from nerfcli.ct.baselines import filtered_back_projection, filtered_misfit, logarithms, sart_total_variation
 from nerfcli.ct.calibrate import air_factors, detector_tilt, found_noise
 from nerfcli.ct.centre import centre_of
 from nerfcli.ct.evaluate import resampled, score_projections, score_volume
@@ -420,6 +420,20 @@ def test_a_dead_pixel_changes_neither_scores_nor_baselines(scan: Scan, grid: Vox
         )
         one, other = (score_volume(volume, grid, true, grid).psnr for volume in both)
         assert other == pytest.approx(one, abs=0.1)
+
+
+def test_views_and_rows_without_usable_pixels_are_no_air(scan: Scan, grid: VoxelGrid) -> None:
+    """Regression: an empty projection and a dead row cost 4 dB of back-projection, 11 dB of SART."""
+    usable, values, true = np.ones(scan.values.shape, bool), scan.values.copy(), truth(grid)
+    usable[3], usable[:, 9] = False, False
+    values[~usable] = 0
+    for method in (filtered_back_projection, sart_total_variation):
+        both = (
+            method(each.geometry.select(each.training_views), logarithms(each, None), grid).numpy()
+            for each in (scan, replace(scan, usable=usable, values=values))
+        )
+        one, other = (score_volume(volume, grid, true, grid).psnr for volume in both)
+        assert other == pytest.approx(one, abs=1.0)  # a row of 24 is that beside it
 
 
 def test_resampling_and_held_out_views() -> None:

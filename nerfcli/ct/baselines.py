@@ -30,8 +30,18 @@ _CIRCULAR = 1e-3
 
 
 def logarithms(scan: Scan, air: Sequence[float] | None) -> np.ndarray:
-    """Return line integrals (V, rows, columns) of the training views, with the open beam of each view corrected."""
-    integrals = scan.line_integrals(scan.training_views)
+    """Return line integrals (V, rows, columns) of the training views, with the open beam of each view corrected.
+
+    Rows without a usable pixel are those of the nearest row with one.
+    """
+    views = scan.training_views
+    integrals, usable = scan.line_integrals(views), scan.of_views("usable", views)
+    if usable is not None:
+        rows = np.arange(scan.geometry.rows)
+        for picture, is_live in zip(integrals, np.broadcast_to(usable.any(axis=2), integrals.shape[:2]), strict=True):
+            if not is_live.all():
+                live = rows[is_live]
+                picture[:] = picture[live[np.abs(live - rows[:, None]).argmin(1)]]
     return integrals if air is None else integrals + np.log(np.asarray(air, dtype=np.float32))[:, None, None]
 
 

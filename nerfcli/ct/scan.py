@@ -73,8 +73,11 @@ class Scan:
 
     @property
     def training_views(self) -> np.ndarray:
-        """Indices of the views to reconstruct from."""
-        return np.setdiff1d(np.arange(self.geometry.views), np.array(self.held_out, dtype=int))
+        """Indices of the views to reconstruct from: those that have a usable pixel and are not held out."""
+        views = np.setdiff1d(np.arange(self.geometry.views), np.array(self.held_out, dtype=int))
+        if self.usable is None or len(self.usable) == 1:
+            return views
+        return views[[bool(self.usable[view].any()) for view in views]]
 
     @property
     def digest(self) -> str:
