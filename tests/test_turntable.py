@@ -372,6 +372,17 @@ class TestPoses:
         assert np.asarray(Image.open(scene_masks(job) / f"{job.names[0]}.png")).all()
         assert mask_turning_object(job, lambda note: None)[0].masks == expected
 
+    def test_a_photo_that_gets_no_mask_any_more_has_no_earlier_one(
+        self, job: Job, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        make = module._make_masks
+        monkeypatch.setattr(module, "_make_masks", lambda *some, **more: [None, *make(*some, **more)[1:]])
+        _, facts = mask_turning_object(job, lambda note: None)
+        assert facts is not None
+        assert (facts["masked"], facts["unmasked"]) == (True, [job.names[0]])
+        there = [(scene_masks(job) / f"{name}.png").exists() for name in job.names]
+        assert there == [False] + [True] * (len(job.names) - 1)
+
     def test_camera_at_two_heights_that_is_turned_a_little_between_photos(self, tmp_path: Path) -> None:
         """The background of either height moves by 10 px (standard deviation) from photo to photo, 1.7 % of 600 px.
 

@@ -326,17 +326,20 @@ def _write_masks(job: Job, masks: Sequence[np.ndarray | None], edited: Collectio
     """Write a mask of each photo for pycolmap, and those that were found for the user, except edited ones."""
     job.mask_folder.mkdir(exist_ok=True)
     stage = Path(job.folder) / _WRITTEN
-    written = read_stage(stage, _VERSION) or {}
-    written = {name: keys for name, keys in written.items() if name in edited or name not in job.names}
+    earlier = read_stage(stage, _VERSION) or {}
+    written = {name: keys for name, keys in earlier.items() if name in edited or name not in job.names}
     write_stage(stage, _VERSION, written)  # what is interrupted below must not be taken for edited
     laid_out = []
     for name, file, key, mask in zip(job.names, job.files, job.keys, masks, strict=True):
         size, target = image_size(job.photos / file), job.mask_folder / f"{file}.png"
+        path = scene_masks(job) / f"{name}.png"
         if mask is None:
             laid_out.append(write_no_mask(target, size))
+            if name in earlier:  # training would use it
+                path.unlink(missing_ok=True)
             continue
         if name not in edited:
-            mask, path = still.enlarged(mask, size), scene_masks(job) / f"{name}.png"
+            mask = still.enlarged(mask, size)
             path.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(mask).save(path)
             written[name] = [key, file_key(path)]
