@@ -250,6 +250,13 @@ def test_a_panorama_with_an_orientation_is_converted_as_stored_and_not_turned(tm
     turned = nerfcli("convert", tmp_path, tmp_path / "scene", "--to", "nerfcli")
     assert turned.exit_code == BAD_INPUT
     assert "images/1.png: a spherical picture with EXIF orientation 3" in error_of(turned)[0]
+    photos(tmp_path, ["images/0.png", "images/1.png"], size=(128, 64))
+    assert nerfcli("convert", tmp_path, tmp_path / "scene", "--to", "nerfcli").exit_code == 0
+    photos(tmp_path, ["images/1.png"], size=(64, 128))
+    with_orientation(tmp_path / "images/1.png", 6)
+    turned_back = nerfcli("convert", tmp_path / "scene", tmp_path / "out.json", "--to", "transforms")
+    assert turned_back.exit_code == BAD_INPUT
+    assert "images/1.png: a spherical picture with EXIF orientation 6" in error_of(turned_back)[0]
 
 
 def test_a_folder_is_listed_once_for_all_names(tmp_path, monkeypatch):

@@ -85,11 +85,7 @@ def turn_to_upright(camera: Camera, measured: Measured, *, path: Path) -> tuple[
     stored = (height, width) if orientation >= 5 else (width, height)
     if stored != (width, height) and _shape_error(camera, stored) > _shape_error(camera, (width, height)):
         return 1, (width, height)
-    if orientation != 1 and camera.is_spherical:
-        raise UserError(
-            f"{path}: a spherical picture with EXIF orientation {orientation}",
-            "save the panorama upright without the tag",
-        )
+    _refuse_sphere(camera, orientation, path)
     return orientation, stored
 
 
@@ -265,11 +261,21 @@ def _turn(frame: Frame, pixels: str) -> int:
     orientation, size = turn_to_upright(frame.camera, measured, path=frame.image)
     if pixels == STORED:
         orientation, size = {6: 8, 8: 6}.get(written, written), (width, height)  # turned back
+        _refuse_sphere(frame.camera, written, frame.image)
     try:
         frame.camera.resized(*size)
     except UserError as error:
         raise UserError(f"{frame.image}: {error.message}", error.hint) from error
     return orientation
+
+
+def _refuse_sphere(camera: Camera, orientation: int, path: Path) -> None:
+    """Refuse to turn a picture of the whole sphere, whose camera cannot be turned about an optical axis."""
+    if orientation != 1 and camera.is_spherical:
+        raise UserError(
+            f"{path}: a spherical picture with EXIF orientation {orientation}",
+            "save the panorama upright without the tag",
+        )
 
 
 def _fits(mask: Path, camera: Camera, before: Camera, pixels: str) -> bool:
