@@ -186,13 +186,13 @@ def plan(names: Iterable[str], budgets: Sequence[float]) -> Iterator[tuple[str, 
     """Yield kind, capture and budget of every cell, the longest trainings last."""
     names = list(names)
     yield from (("poses", name, 0.0) for name in names if CAPTURES[name].posed)
-    usual = min(budgets, key=lambda budget: abs(budget - USUAL_S))
+    usual, browser = min(budgets, key=lambda budget: abs(budget - USUAL_S)), has_browser()
     for budget in sorted(budgets):
         yield from (("quality", name, budget) for name in names)
         if budget == usual:
             yield from (("depth", name, budget) for name in names if CAPTURES[name].depth)
             yield from (("splats", name, budget) for name in names)
-            yield from (("page", name, budget) for name in names if has_browser())
+            yield from (("page", name, budget) for name in names if browser)
 
 
 def read_cells(path: Path) -> list[Cell]:

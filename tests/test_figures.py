@@ -68,9 +68,11 @@ def test_a_cell_is_measured_once_for_a_commit_and_kept_at_once(monkeypatch, tmp_
     assert (tmp_path / "figures.md").read_text(encoding="utf-8") == figures.page(kept)
 
 
-def test_every_capture_has_its_cells_and_long_trainings_come_last():
+@pytest.mark.parametrize("pages", [0, 9])
+def test_every_capture_has_its_cells_and_long_trainings_come_last(monkeypatch, pages):
+    monkeypatch.setattr(figures, "has_browser", lambda: bool(pages))
     cells = list(figures.plan(figures.CAPTURES, figures.BUDGETS))
     assert [kind for kind, _, _ in cells[-9:]] == ["quality"] * 9
     assert {budget for _, _, budget in cells[-9:]} == {1800.0}
     assert ("splats", "desk", 300.0) in cells
-    assert len(cells) == len(set(cells)) == 8 + 3 * 9 + 2 + 9
+    assert len(cells) == len(set(cells)) == 8 + 3 * 9 + 2 + 9 + pages
