@@ -199,6 +199,13 @@ def test_a_disk_that_cannot_be_replaced_is_refused_before_rendering(model, tmp_p
     assert set(tmp_path.iterdir()) == {disk, link}
 
 
+def test_videos_of_a_mounted_folder_are_written_into_it(model, tmp_path, monkeypatch):
+    render(model, job_of(video=None), tmp_path / "views")
+    monkeypatch.setattr("os.path.ismount", lambda path: path == tmp_path / "views")
+    render(model, job_of(), tmp_path / "views")
+    assert list((tmp_path / "views").glob("*.gif"))
+
+
 def test_a_job_that_is_stopped_leaves_the_old_folder(model, tmp_path):
     render(model, job_of(2), tmp_path / "views")
     old = contents(tmp_path / "views")

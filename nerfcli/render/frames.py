@@ -91,7 +91,7 @@ def render_job(
         clear_leftovers(place.parent)
         unfinished.discard()
         return job.results(folder)
-    if os.path.ismount(place):
+    if job.facts_in(folder) is None and os.path.ismount(place):
         raise UserError(
             f"{folder} is a mounted disk, which no folder can replace",
             f"choose a folder in it: -o {in_shell(folder / 'renders')}",
