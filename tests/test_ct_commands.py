@@ -453,11 +453,20 @@ def test_few_views_and_columns_are_refused_or_checked(tmp_path: Path) -> None:
     save_scan(tmp_path / "scan", scan)
     code, _, err = call("train", tmp_path / "scan", "--passes", "1")
     assert code == 3
-    assert err.startswith(f"Error: {tmp_path / 'scan'} has 2 views that are not held out, expected 3\n")
+    assert err.startswith(
+        f"Error: {tmp_path / 'scan'} has 2 views with usable pixels that are not held out, expected 3\n"
+    )
     assert "with fewer views held out" in err
     save_scan(tmp_path / "few", scan_of(cone(2, rows=2, columns=4)))
     assert (
         "Hint:  a reconstruction needs more views of the object" in call("train", tmp_path / "few", "--passes", "1")[2]
+    )
+    usable = np.ones((9, 1, 1), bool)
+    usable[2:] = False
+    save_scan(tmp_path / "empty", replace(scan_of(cone(9, rows=2, columns=4)), usable=usable))
+    assert (
+        "Hint:  a reconstruction needs more views of the object"
+        in call("train", tmp_path / "empty", "--passes", "1")[2]
     )
     assert not (tmp_path / "scan-run").exists()
     code, out, err = call("doctor", tmp_path / "scan")

@@ -434,6 +434,7 @@ def test_views_and_rows_without_usable_pixels_are_no_air(scan: Scan, grid: Voxel
         )
         one, other = (score_volume(volume, grid, true, grid).psnr for volume in both)
         assert other == pytest.approx(one, abs=1.0)  # a row of 24 is that beside it
+    assert highest_contrast_row(replace(scan, usable=usable)).geometry.views == scan.geometry.views - 1
 
 
 def test_resampling_and_held_out_views() -> None:

@@ -351,7 +351,7 @@ ONE_MATERIAL = 0.97
 def centre(sample: Sample) -> Finding | str:
     """Estimate the centre of rotation."""
     scan = sample.scan
-    if scan.geometry.views < FEWEST_VIEWS:
+    if len(scan.live_views) < FEWEST_VIEWS:
         return "too few views"
     row = highest_contrast_row(scan)
     stated = axis_column(scan.geometry)
@@ -371,7 +371,7 @@ def centre(sample: Sample) -> Finding | str:
 
 def beam_hardening(sample: Sample) -> Finding | str:
     """Measure how far line integrals fall below proportionality to path lengths, in an object of one material."""
-    if sample.scan.geometry.views < FEWEST_VIEWS:
+    if len(sample.scan.live_views) < FEWEST_VIEWS:
         return "too few views"
     row = highest_contrast_row(sample.scan).thinned().binned(FINE)
     volume, grid = reconstructed(row)

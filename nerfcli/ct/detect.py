@@ -80,9 +80,9 @@ def judge(scan: Scan, *, progress: Progress = no_progress) -> Judgement:
     Raises:
         UserError: there are too few views.
     """
-    if scan.geometry.views < FEWEST_VIEWS:
+    if len(scan.live_views) < FEWEST_VIEWS:
         raise UserError(
-            f"{scan.geometry.views} views are too few to judge the geometry",
+            f"{len(scan.live_views)} views are too few to judge the geometry",
             f"use a scan with at least {FEWEST_VIEWS} views",
         )
     row = highest_contrast_row(scan).thinned()

@@ -51,9 +51,9 @@ def highest_contrast_row(scan: Scan, views: np.ndarray | None = None) -> Row:
     """Choose the row with the most contrast; for a cone beam, only among rows near the plane of the source.
 
     Args:
-        views: indices of the views to read; all if not given.
+        views: indices of the views to read; all that have a usable pixel if not given.
     """
-    views = np.arange(scan.geometry.views) if views is None else views
+    views = scan.live_views if views is None else views
     geometry = scan.geometry.select(views)
     rows = np.arange(geometry.rows)
     if geometry.beam == "cone" and geometry.rows > 1:

@@ -72,12 +72,15 @@ class Scan:
             raise ValueError(f"held-out views {self.held_out} of {self.geometry.views}")
 
     @property
+    def live_views(self) -> np.ndarray:
+        """Indices of the views that have a usable pixel."""
+        views = np.arange(self.geometry.views)
+        return views if self.usable is None or len(self.usable) == 1 else views[[part.any() for part in self.usable]]
+
+    @property
     def training_views(self) -> np.ndarray:
-        """Indices of the views to reconstruct from: those that have a usable pixel and are not held out."""
-        views = np.setdiff1d(np.arange(self.geometry.views), np.array(self.held_out, dtype=int))
-        if self.usable is None or len(self.usable) == 1:
-            return views
-        return views[[bool(self.usable[view].any()) for view in views]]
+        """Indices of the views to reconstruct from: live ones that are not held out."""
+        return np.setdiff1d(self.live_views, np.array(self.held_out, dtype=int))
 
     @property
     def digest(self) -> str:

@@ -84,11 +84,11 @@ def train_scan(
     run = output.beside(folder, "-run")
     loaded = load_scan(folder)
     if len(loaded.training_views) < LEAST_VIEWS:
-        enough = loaded.geometry.views >= LEAST_VIEWS
+        views = several(len(loaded.training_views), "view")
         raise UserError(
-            f"{folder} has {several(len(loaded.training_views), 'view')} that are not held out, expected {LEAST_VIEWS}",
+            f"{folder} has {views} with usable pixels that are not held out, expected {LEAST_VIEWS}",
             "convert it again, with fewer views held out"
-            if enough
+            if len(loaded.live_views) >= LEAST_VIEWS
             else "a reconstruction needs more views of the object",
         )
     if settings.centre is not None and abs(settings.centre) > loaded.geometry.columns:
