@@ -3,6 +3,8 @@
 import csv
 import json
 import math
+from pathlib import Path
+from typing import Any
 
 import pytest
 from commands import error_of, listing, nerfcli
@@ -20,7 +22,10 @@ from nerfcli.bench.ablation import (
     variants,
 )
 from nerfcli.cli import app
+from nerfcli.output import Output
 from nerfcli.training.runs.components import CHOICES, Components
+from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.workflows import ablate as ablation
 
 ALL = CaptureTraits(has_alpha=False, has_points=True, has_exif=True)
 
@@ -114,6 +119,21 @@ def test_an_ablation_goes_on_where_it_stopped(tmp_path, monkeypatch):
         assert (refused.exit_code, len(trained)) == (3, 5)
         assert "ablation.json exists" in refused.stderr
     assert listing(tmp_path / "out") == before
+
+
+def test_sizes_that_depend_on_the_device_are_compared(monkeypatch, tmp_path):
+    """Regression: an ablation begun on a CPU went on with the larger steps and tables of a GPU."""
+    about = []
+
+    def compared(output: Output, folder: Path, what: dict[str, Any]) -> None:
+        about.append({name: value for name, value in what["settings"].items() if name != "device"})
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ablation, "refuse_others", compared)
+    for device in ("cpu", "cuda"):
+        with pytest.raises(KeyboardInterrupt):
+            ablation.ablate_scene(SPHERES, Output(tmp_path), TrainSettings(device=device), seeds=1)
+    assert about[0] != about[1]
 
 
 def test_something_else_is_left_alone(tmp_path):

@@ -63,6 +63,14 @@ def ablate_scene(
     scene = load_scene(path)
     refuse_without_held_out_photos(scene)
     folder = output.beside(path, "-ablation")
+    # Written out, so that an ablation is not continued with the sizes of another type of device.
+    first, most = settings.samples
+    settings = replace(
+        settings,
+        first_samples_per_step=first,
+        samples_per_step=most,
+        log2_rows=settings.chosen_log2_rows if settings.on_gpu else settings.log2_rows,
+    )
     about: dict[str, Any] = {"scene": str(path), "settings": settings.to_json()}
     about |= {"seeds": seeds, "varied": list(only or CHOICES)}
     refuse_others(output, folder, about)
