@@ -786,6 +786,17 @@ def test_masks_that_are_missing_are_left_out_and_named(tmp_path):
     assert capture.notes == ("1 mask named in transforms.json left out, not found: masks/1.png",)
 
 
+@pytest.mark.parametrize("on_disk", ["masks/0.jpg.png", "masks/0_mask.png"])
+def test_masks_that_are_named_after_the_photo_are_found(on_disk, tmp_path):
+    photos(tmp_path, [*numbered("{}.jpg"), on_disk])
+    content = transforms_record(numbered("{}.jpg"))
+    for frame, mask in zip(content["frames"], ("masks\\0.jpg", "1.jpg", "/"), strict=False):
+        frame["mask_path"] = mask
+    capture = read_again(tmp_path, content)
+    assert [frame.mask for frame in capture.frames] == [tmp_path / on_disk, *[None] * (COUNT - 1)]
+    assert capture.notes == ("1 mask named in transforms.json left out, not found: 1.jpg",)
+
+
 def test_masks_are_found_by_the_photos_as_they_are_on_disk(tmp_path):
     photos(tmp_path, [*numbered("images/my view {}.png"), "masks/my view 1.png"])
     transforms(tmp_path, numbered("images/my%20view%20{}.png"))

@@ -40,6 +40,7 @@ from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts
 from nerfcli.captures.orientation import stored_size
 from nerfcli.errors import UserError, several
 from nerfcli.errors import listed as in_words
+from nerfcli.photos.masks import find_mask
 
 SPLITS = ("train", "val", "test")
 
@@ -195,7 +196,8 @@ def _beside(
     """Return the mask or depth map that each frame names under a key, None if it is not on disk, and what is lost.
 
     Args:
-        noun: what it is. A depth map has the suffix that is named: another file is a preview of it.
+        noun: what it is. For a mask, its photo's name is enough, see `find_mask`. A depth map has the suffix that is
+            named: another file is a preview of it.
         places: the folder that paths are relative to, and the usual name of the folder of these files in it.
         photos: none of which it can be.
     """
@@ -203,11 +205,15 @@ def _beside(
     for text, (_, where) in zip(texts, listed, strict=True):
         if not isinstance(text, str):
             raise malformed(where, f"{key} is {text!r:.80}", f"expected the path of a {noun} as text")
-    named = {text for text in texts if text.strip()}
+    named = {text for text in texts if PurePosixPath(plain_name(text)).name}
     found = find_photos(sorted(named), (places[0],), folders=(places[1],), others=())
+    files = [
+        find_mask(plain_name(name), places[0]) if noun == "mask" and (file is None or file in photos) else file
+        for name, file in zip(found.listed, found.paths, strict=True)
+    ]
     paths = {
         name: file
-        for name, file in zip(found.listed, found.paths, strict=True)
+        for name, file in zip(found.listed, files, strict=True)
         if file is not None and file not in photos and (noun == "mask" or Name.of(name).suffix == file.suffix.lower())
     }
     lost = sorted(named - paths.keys())
