@@ -806,24 +806,26 @@ def test_masks_are_found_by_the_photos_as_they_are_on_disk(tmp_path):
 
 def test_depth_maps_under_other_names_and_those_that_are_missing(tmp_path):
     content = written(tmp_path)
-    photos(tmp_path, ["depth/0.png", "depth/1.png", "depth/0 left.png"])
+    photos(tmp_path, ["depth/0.png", "depth/1.png", "depth/0 left.png", "depth/3.png", "depth/4.tif"])
     (tmp_path / "depth/2.npy").touch()
-    named = ("C:\\x\\depth\\0.png", "depth\\1.PNG", "depth/2.npy", "depth/3.png", "", None)
+    named = ("C:\\x\\depth\\0.png", "depth\\1.PNG", "depth/2.npy", "depth/3", "depth/4.tiff", "depth/5.png", "", None)
     for frame, depth in zip(content["frames"], named, strict=False):
         frame["depth_file_path"] = depth
     capture = read_again(tmp_path, content)
     maps = [None if frame.depth is None else frame.depth.path for frame in capture.frames]
-    assert maps == [*(tmp_path / "depth" / name for name in ("0.png", "1.png", "2.npy")), *[None] * (COUNT - 3)]
-    assert capture.notes == ("1 depth map named in transforms.json left out, not found: depth/3.png",)
+    there = [tmp_path / "depth" / name for name in ("0.png", "1.png", "2.npy", "3.png", "4.tif")]
+    assert maps == [*there, *[None] * (COUNT - 5)]
+    assert capture.notes == ("1 depth map named in transforms.json left out, not found: depth/5.png",)
 
 
 def test_a_preview_is_not_taken_for_the_depth_map(tmp_path):
     content = written(tmp_path)
-    photos(tmp_path, ["depth/0.png"])
+    photos(tmp_path, ["depth/0.png", "depth/1.jpg"])
     content["frames"][0]["depth_file_path"] = "depth/0.npy"
+    content["frames"][1]["depth_file_path"] = "depth/1"
     capture = read_again(tmp_path, content)
-    assert capture.frames[0].depth is None
-    assert capture.notes == ("1 depth map named in transforms.json left out, not found: depth/0.npy",)
+    assert [frame.depth for frame in capture.frames] == [None] * COUNT
+    assert capture.notes == ("2 depth maps named in transforms.json left out, not found: depth/0.npy, depth/1",)
 
 
 def test_equal_labels_of_metashape_are_told_apart_by_their_groups(tmp_path):

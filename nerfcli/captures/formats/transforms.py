@@ -196,8 +196,7 @@ def _beside(
     """Return the mask or depth map that each frame names under a key, None if it is not on disk, and what is lost.
 
     Args:
-        noun: what it is. For a mask, its photo's name is enough, see `find_mask`. A depth map has the suffix that is
-            named: another file is a preview of it.
+        noun: what it is. For a mask, its photo's name is enough, see `find_mask`.
         places: the folder that paths are relative to, and the usual name of the folder of these files in it.
         photos: none of which it can be.
     """
@@ -214,11 +213,18 @@ def _beside(
     paths = {
         name: file
         for name, file in zip(found.listed, files, strict=True)
-        if file is not None and file not in photos and (noun == "mask" or Name.of(name).suffix == file.suffix.lower())
+        if file is not None and file not in photos and (noun == "mask" or _may_be_depth(file, name))
     }
     lost = sorted(named - paths.keys())
     notes = (f"{several(len(lost), noun)} named in {path.name} left out, not found: {in_words(lost)}",)
     return [paths.get(text) for text in texts], notes if lost else ()
+
+
+def _may_be_depth(file: Path, listed: str) -> bool:
+    """Return whether a file may be the depth map of a listed name; one with another suffix is a preview of it."""
+    suffix, named = file.suffix.lower(), Name.of(listed).suffix
+    same = (".tif", ".tiff")
+    return suffix == named or (suffix in same and named in same) or (not named and suffix in (".png", ".pgm", *same))
 
 
 def relative_path(frame: Frame, folder: Path) -> str:
