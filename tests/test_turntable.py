@@ -345,13 +345,18 @@ class TestPoses:
             assert report["moving_foreground"]["masked"]
             assert report["images"][0]["registered"]
 
-    @pytest.mark.parametrize("found", [None, np.ones((36, 48), bool)])
+    @pytest.mark.parametrize(
+        ("found", "first"), [(None, 0), (np.ones((36, 48), bool), 0), (np.ones((36, 48), bool), 1)]
+    )
     def test_masks_that_were_mended_are_used_whatever_is_found(
-        self, job: Job, monkeypatch: pytest.MonkeyPatch, found: np.ndarray | None
+        self, job: Job, monkeypatch: pytest.MonkeyPatch, found: np.ndarray | None, first: int
     ) -> None:
-        """Also where the background of a photo matches no other any more, and where the masks made now are refused."""
+        """Also where the background of a photo matches no other any more, and where the masks made now are refused.
+
+        Photos before the first mended mask get none then.
+        """
         mended = []
-        for name in job.names:
+        for name in job.names[first:]:
             path = scene_masks(job) / f"{name}.png"
             mended.append(np.asarray(Image.open(path)).copy())
             mended[-1][:150] = False  # most of the object
@@ -359,8 +364,10 @@ class TestPoses:
         monkeypatch.setattr(module, "_make_masks", lambda *_, **__: [found] * len(job.files))
         used, facts = mask_turning_object(job, lambda note: None)
         assert facts is not None
-        assert (facts["masked"], facts["unmasked"]) == (True, [])
-        assert [mask.used_fraction for mask in used.masks] == [mask.mean() for mask in mended]
+        assert (facts["masked"], facts["unmasked"]) == (True, list(job.names[:first]))
+        assert [mask.used_fraction for mask in used.masks] == [1.0] * first + [mask.mean() for mask in mended]
+        said = "no masks of the rest could be created, because they would cover 100.0 % of a photo"
+        assert (said in describe_motions(facts)) == (first > 0)
 
     def test_masks_of_a_run_that_was_interrupted_are_not_taken_for_mended_ones(self, job: Job) -> None:
         expected = mask_turning_object(job, lambda note: None)[0].masks

@@ -155,10 +155,11 @@ def mask_turning_object(job: Job, tell: Tell) -> tuple[Job, dict[str, Any] | Non
     if motions.found:
         tell("the object turns in front of a background that does not, as on a turntable: making masks of it")
         edited, made = _edited_masks(job, tell), _make_masks(photos, training, others=job.held_out)
+        facts |= _judge_masks(made, compared)
+        if "why_not" in facts:  # which does not concern the user's
+            made = [None] * len(made)
         masks = [edited.get(name, mask) for name, mask in zip(job.names, made, strict=True)]
-        if len(edited) < len(masks):  # the user's are not judged
-            facts |= _judge_masks(made, compared)
-    facts["masked"] = facts.get("why_not") is None and motions.found
+    facts["masked"] = any(mask is not None for mask in masks)
     facts["unmasked"] = [name for name, mask in zip(job.names, masks, strict=True) if mask is None]
     if facts["masked"]:
         job = replace(job, masks=_write_masks(job, masks, edited))
@@ -179,7 +180,10 @@ def describe_motions(facts: dict[str, Any]) -> str:
         )
     unmasked = len(facts["unmasked"])
     rest = f", except for {several(unmasked, 'photo')}" if unmasked else ""
-    return f"{text}: its masks are in {MASKS}/ of the scene{rest}, and the poses are relative to the object"
+    text = f"{text}: its masks are in {MASKS}/ of the scene{rest}, and the poses are relative to the object"
+    if unmasked and "why_not" in facts:
+        text += f"; no masks of the rest could be created, because {facts['why_not']}"
+    return text
 
 
 def add_advice(error: UserError, facts: dict[str, Any] | None) -> UserError:
