@@ -390,6 +390,32 @@ class TestPoses:
         there = [(scene_masks(job) / f"{name}.png").exists() for name in job.names]
         assert there == [False] + [True] * (len(job.names) - 1)
 
+    def test_a_mended_mask_stays_where_a_photo_that_was_saved_anew_gets_none(
+        self, job: Job, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        make, path = module._make_masks, scene_masks(job) / f"{job.names[0]}.png"
+        Image.fromarray(~np.asarray(Image.open(path))).save(path)
+        mended = path.read_bytes()
+        monkeypatch.setattr(module, "_make_masks", lambda *some, **more: [None, *make(*some, **more)[1:]])
+        _, facts = mask_turning_object(replace(job, keys=("new", *job.keys[1:])), lambda note: None)
+        assert facts is not None
+        assert facts["unmasked"] == [job.names[0]]
+        assert path.read_bytes() == mended
+
+    def test_a_photo_that_gets_no_mask_has_none_of_a_run_that_was_interrupted(self, job: Job) -> None:
+        """The first mask was written by that run, the last one before it."""
+        make = module._make_masks
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(still, "enlarged", lambda mask, size: np.ones(size[::-1], bool))
+            patched.setattr(module, "write_mask", Mock(side_effect=KeyboardInterrupt))
+            with pytest.raises(KeyboardInterrupt):
+                mask_turning_object(job, lambda note: None)
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(module, "_make_masks", lambda *some, **more: [None, *make(*some, **more)[1:-1], None])
+            mask_turning_object(job, lambda note: None)
+        there = [(scene_masks(job) / f"{name}.png").exists() for name in job.names]
+        assert there == [False] + [True] * (len(job.names) - 2) + [False]
+
     def test_camera_at_two_heights_that_is_turned_a_little_between_photos(self, tmp_path: Path) -> None:
         """The background of either height moves by 10 px (standard deviation) from photo to photo, 1.7 % of 600 px.
 

@@ -330,17 +330,19 @@ def _write_masks(job: Job, masks: Sequence[np.ndarray | None], edited: Collectio
     """Write a mask of each photo for pycolmap, and those that were found for the user, except edited ones."""
     job.mask_folder.mkdir(exist_ok=True)
     stage = Path(job.folder) / _WRITTEN
-    earlier = read_stage(stage, _VERSION) or {}
-    written = {name: keys for name, keys in earlier.items() if name in edited or name not in job.names}
-    write_stage(stage, _VERSION, written)  # what is interrupted below must not be taken for edited
+    made = [name for name, mask in zip(job.names, masks, strict=True) if mask is not None and name not in edited]
+    # What is interrupted below must be taken for ours, not for edited.
+    written = (read_stage(stage, _VERSION) or {}) | {name: ["", ""] for name in made}
+    write_stage(stage, _VERSION, written)
     laid_out = []
     for name, file, key, mask in zip(job.names, job.files, job.keys, masks, strict=True):
         size, target = image_size(job.photos / file), job.mask_folder / f"{file}.png"
         path = scene_masks(job) / f"{name}.png"
         if mask is None:
             laid_out.append(write_no_mask(target, size))
-            if name in earlier:  # training would use it
-                path.unlink(missing_ok=True)
+            photo_key, mask_key = written.pop(name, (None, None))
+            if path.is_file() and (photo_key in ("", key) or file_key(path) == mask_key):  # training would use it
+                path.unlink()
             continue
         if name not in edited:
             mask = still.enlarged(mask, size)
