@@ -804,6 +804,14 @@ def test_masks_are_found_by_the_photos_as_they_are_on_disk(tmp_path):
     assert [frame.mask for frame in capture.frames] == [None, tmp_path / "masks/my view 1.png", *[None] * (COUNT - 2)]
 
 
+def test_masks_of_photos_of_one_name_are_found_by_their_folders_on_disk(tmp_path):
+    sides = ("left/my view.png", "right/my view.png")
+    photos(tmp_path, [*(f"{folder}/{name}" for folder in ("images", "masks") for name in sides), "masks/my view.png"])
+    transforms(tmp_path, [f"images/{name.replace(' ', '%20')}" for name in sides])
+    capture = with_masks(parsed(tmp_path), tmp_path / "masks")
+    assert [frame.mask for frame in capture.frames] == [tmp_path / "masks" / name for name in sides]
+
+
 def test_depth_maps_under_other_names_and_those_that_are_missing(tmp_path):
     content = written(tmp_path)
     photos(tmp_path, ["depth/0.png", "depth/1.png", "depth/0 left.png", "depth/3.png", "depth/4.tif"])

@@ -178,7 +178,10 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
     """
     if not folder.is_dir():
         raise UserError(f"the mask folder {folder} does not exist", "give a folder with a mask for each photo")
-    found = [mask_of(f.name, folder) or (mask_of(f.image.name, folder) if f.image else None) for f in capture.frames]
+    found = [
+        mask_of(f.name, folder) or (mask_of(_end_on_disk(f.name, f.image), folder) if f.image else None)
+        for f in capture.frames
+    ]
     if not any(found):
         raise UserError(
             f"{folder} contains no mask for any of the {len(found)} photos",
@@ -189,3 +192,9 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
             raise UserError(f"{folder} contains photos, such as {frame.name}", "give a folder that has only masks")
     frames = (f if mask is None else replace(f, mask=mask) for f, mask in zip(capture.frames, found, strict=True))
     return replace(capture, frames=tuple(frames))
+
+
+def _end_on_disk(name: str, image: Path) -> str:
+    """Return the end of a photo's path that has as many parts as its name in the capture."""
+    parts = image.relative_to(image.anchor).parts
+    return "/".join(parts[-len(name.split("/")) :])
