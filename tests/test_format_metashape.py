@@ -219,6 +219,13 @@ def test_a_disabled_chunk_and_one_of_disabled_cameras_are_not_read_before_anothe
     assert capture.notes[0].startswith("chunk 1 (Chunk 1) with 2 cameras is read; others")
 
 
+def test_of_chunks_without_usable_cameras_that_with_cameras_is_described(tmp_path):
+    text = document(sensor_xml({"f": 500.0}), camera_xml("a", more=' enabled="false"'))
+    path = write(tmp_path, text.replace("<chunk", '<chunk label="empty"/><chunk', 1))
+    with pytest.raises(UserError, match="no images with a pose: 'a' is disabled in Metashape"):
+        parse_metashape(path)
+
+
 def test_each_camera_has_its_sensor(tmp_path):
     sensors = sensor_xml({"f": 500.0}) + sensor_xml({"f": 300.0}, size=(100, 80), key="3")
     capture = parse_metashape(write(tmp_path, document(sensors, camera_xml("a") + camera_xml("b", sensor="3"))))

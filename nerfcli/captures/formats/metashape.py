@@ -149,6 +149,8 @@ def _one_of(kind: str, counts: Mapping[str, int], kept: str) -> list[str]:
 def _chunk(path: Path) -> tuple[Element, list[str]]:
     """Return the chunk with most cameras that give frames, an enabled one first, and a note on the others.
 
+    If no camera gives a frame, it is the first chunk with cameras, which say why.
+
     A chunk is the root's child in an exported file, the root itself in the file of a project.
     """
     root = read_xml(path, _EXPECTED)
@@ -156,8 +158,13 @@ def _chunk(path: Path) -> tuple[Element, list[str]]:
     if not chunks:
         raise malformed(str(path), f"has no chunk element, but a {shown(root.tag)}", _EXPECTED)
     names = [f"{number} ({chunk.get('label', '')})" for number, chunk in enumerate(chunks, start=1)]
-    usable = [list(_reasons(chunk).values()).count("") for chunk in chunks]
-    best = max(range(len(chunks)), key=lambda index: (usable[index] * _is_enabled(chunks[index]), usable[index]))
+    reasons = [list(_reasons(chunk).values()) for chunk in chunks]
+    usable = [of_chunk.count("") for of_chunk in reasons]
+    ranks = [
+        (count * _is_enabled(chunk), count, len(of_chunk) > 0)
+        for chunk, count, of_chunk in zip(chunks, usable, reasons, strict=True)
+    ]
+    best = ranks.index(max(ranks))
     return chunks[best], _one_of("chunk", dict(zip(names, usable, strict=True)), names[best])
 
 
