@@ -101,6 +101,17 @@ def test_poses_neither_reads_a_video_nor_unpacks_photos_for_a_scene_that_is_refu
     assert list(tmp_path.iterdir()) == [tmp_path / name]
 
 
+@pytest.mark.parametrize("name", ["clip.mp4", "photos.zip"])
+def test_poses_do_not_replace_the_frames_of_a_scene_by_those_of_one_that_is_refused(name, tmp_path, monkeypatch):
+    """Regression: the scene that stayed named frames that were gone."""
+    monkeypatch.chdir(tmp_path)
+    Path(name).write_bytes(b"x")
+    Path(f"{Path(name).stem}-scene").mkdir()
+    Path(f"{Path(name).stem}-scene", "scene.json").write_text("{}")
+    result = nerfcli("poses", name, "--masks", "nowhere", "--overwrite")
+    assert error_of(result)[0] == f"Error: the mask folder {tmp_path}/nowhere does not exist"
+
+
 def test_doctor_refuses_a_run(finished):
     error, hint = error_of(nerfcli("doctor", finished))
     assert error == f"Error: {finished} is a run: doctor examines photos and scenes"

@@ -56,7 +56,8 @@ def estimate_poses(
     source = Path(photos)
     target = output.beside(without_suffix(source), "-scene")
     folder = frames_folder(target) if source.is_file() else source
-    if source.is_file() and not (target / SCENE_FILE).exists():  # before its files or frames are written
+    if source.is_file() and (output.overwrite or not (target / SCENE_FILE).exists()):
+        # Before its files or frames are written.
         check_settings(settings)
         check_destination(target, folder, subfolders=settings.subfolders)
     if is_archive(source):
