@@ -214,7 +214,7 @@ def _step(
 def prepare_splats(notify: Callable[[str], None]) -> None:
     """Compile the kernels of splats or load them from the cache, before any time budget starts to run."""
     if not any(machine_code.folder().glob("splat_compositing*.nbi")):
-        notify("compiling the kernels of splats (once per machine, 20 seconds)")
+        notify("compiling the kernels of splats (once per machine, half a minute)")
     table = np.zeros((2, 8, 8))
     view = SplatView(np.eye(3), np.array([0.0, 0.0, 1.0]), 16, 16, 0.0, table, np.full(2, -4.0), np.ones(2))
     rows = np.zeros((1, 14), np.float32)
