@@ -231,18 +231,18 @@ def test_an_interrupt_saves_the_splats_and_writes_no_file(run: Path, monkeypatch
             os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr(refinement, "step_splats", interrupted)
-    target, told = run.with_name("interrupted.ply"), []
+    target, notes = run.with_name("interrupted.ply"), []
     with pytest.raises(KeyboardInterrupt):
         nerfcli.export_run(
             run,
             Output(target),
             to="splats",
             splats=replace(SMALL, budget_seconds=60),
-            reporter=Reporter(note=told.append),
+            reporter=Reporter(note=notes.append),
         )
     assert not target.exists()
     assert load_splat_state(run / SPLATS).refinement.steps == 3
-    assert told[-1] == "the splats are saved; to continue, add --resume to the same command"
+    assert notes[-1] == "the splats are saved; to continue, add --resume to the same command"
 
 
 def test_splats_of_a_run_in_a_read_only_folder_are_exported(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,12 +252,12 @@ def test_splats_of_a_run_in_a_read_only_folder_are_exported(run: Path, monkeypat
         raise UserError(f"cannot write {path}: Read-only file system", "free it")
 
     monkeypatch.setattr("nerfcli.workflows.splats.save_splats", refuse)
-    told: list[str] = []
+    notes: list[str] = []
     other = replace(SMALL, count=700, budget_seconds=0.2)
     nerfcli.export_run(
-        run, Output(run.with_name("r.ply")), to="splats", splats=other, reporter=Reporter(note=told.append)
+        run, Output(run.with_name("r.ply")), to="splats", splats=other, reporter=Reporter(note=notes.append)
     )
-    assert f"the splats could not be saved in the run: cannot write {run / SPLATS}: Read-only file system" in told
+    assert f"the splats could not be saved in the run: cannot write {run / SPLATS}: Read-only file system" in notes
     assert len(nerfcli.load_splats(run.with_name("r.ply")).gaussians) <= 700
 
 

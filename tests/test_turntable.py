@@ -331,7 +331,7 @@ class TestPoses:
             assert (truth & ~mask).sum() < 0.03 * truth.sum()
             assert (mask & ~truth).sum() < 0.03 * truth.size
 
-    def test_masks_that_were_mended_by_hand_are_used(self, made: tuple[Path, dict, list[str]]) -> None:
+    def test_masks_that_were_edited_by_hand_are_used(self, made: tuple[Path, dict, list[str]]) -> None:
         """Existing masks are kept when poses are estimated again, also when features change."""
         folder = made[0]
         mask = sorted((folder / "scene" / "masks").iterdir())[0]
@@ -348,28 +348,28 @@ class TestPoses:
     @pytest.mark.parametrize(
         ("found", "first"), [(None, 0), (np.ones((36, 48), bool), 0), (np.ones((36, 48), bool), 1)]
     )
-    def test_masks_that_were_mended_are_used_whatever_is_found(
+    def test_masks_that_were_edited_are_used_whatever_is_found(
         self, job: Job, monkeypatch: pytest.MonkeyPatch, found: np.ndarray | None, first: int
     ) -> None:
         """Also where the background of a photo matches no other any more, and where the masks made now are refused.
 
-        Photos before the first mended mask get none then.
+        Photos before the first edited mask get none then.
         """
-        mended = []
+        edited = []
         for name in job.names[first:]:
             path = scene_masks(job) / f"{name}.png"
-            mended.append(np.asarray(Image.open(path)).copy())
-            mended[-1][:150] = False  # most of the object
-            Image.fromarray(mended[-1]).save(path)
+            edited.append(np.asarray(Image.open(path)).copy())
+            edited[-1][:150] = False  # most of the object
+            Image.fromarray(edited[-1]).save(path)
         monkeypatch.setattr(module, "_make_masks", lambda *_, **__: [found] * len(job.files))
         used, facts = mask_turning_object(job, lambda note: None)
         assert facts is not None
         assert (facts["masked"], facts["unmasked"]) == (True, list(job.names[:first]))
-        assert [mask.used_fraction for mask in used.masks] == [1.0] * first + [mask.mean() for mask in mended]
+        assert [mask.used_fraction for mask in used.masks] == [1.0] * first + [mask.mean() for mask in edited]
         said = "no masks of the rest could be created, because they would cover 100.0 % of a photo"
         assert (said in describe_motions(facts)) == (first > 0)
 
-    def test_masks_of_a_run_that_was_interrupted_are_not_taken_for_mended_ones(self, job: Job) -> None:
+    def test_masks_of_a_run_that_was_interrupted_are_not_taken_for_edited_ones(self, job: Job) -> None:
         expected = mask_turning_object(job, lambda note: None)[0].masks
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr(still, "enlarged", lambda mask, size: np.ones(size[::-1], bool))
@@ -390,17 +390,17 @@ class TestPoses:
         there = [(scene_masks(job) / f"{name}.png").exists() for name in job.names]
         assert there == [False] + [True] * (len(job.names) - 1)
 
-    def test_a_mended_mask_stays_where_a_photo_that_was_saved_anew_gets_none(
+    def test_an_edited_mask_of_a_photo_that_was_saved_again_is_kept(
         self, job: Job, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         make, path = module._make_masks, scene_masks(job) / f"{job.names[0]}.png"
         Image.fromarray(~np.asarray(Image.open(path))).save(path)
-        mended = path.read_bytes()
+        edited = path.read_bytes()
         monkeypatch.setattr(module, "_make_masks", lambda *some, **more: [None, *make(*some, **more)[1:]])
         _, facts = mask_turning_object(replace(job, keys=("new", *job.keys[1:])), lambda note: None)
         assert facts is not None
         assert facts["unmasked"] == [job.names[0]]
-        assert path.read_bytes() == mended
+        assert path.read_bytes() == edited
 
     def test_a_photo_that_gets_no_mask_has_none_of_a_run_that_was_interrupted(self, job: Job) -> None:
         """The first mask was written by that run, the last one before it."""

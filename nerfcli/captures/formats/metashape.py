@@ -149,7 +149,7 @@ def _one_of(kind: str, counts: Mapping[str, int], kept: str) -> list[str]:
 def _chunk(path: Path) -> tuple[Element, list[str]]:
     """Return the chunk with most cameras that give frames, an enabled one first, and a note on the others.
 
-    If no camera gives a frame, it is the first chunk with cameras, which say why.
+    If no camera gives a frame, it is the first chunk with cameras, so that the error can say why.
 
     A chunk is the root's child in an exported file, the root itself in the file of a project.
     """

@@ -156,7 +156,7 @@ def mask_turning_object(job: Job, tell: Tell) -> tuple[Job, dict[str, Any] | Non
         tell("the object turns in front of a background that does not, as on a turntable: making masks of it")
         edited, made = _edited_masks(job, tell), _make_masks(photos, training, others=job.held_out)
         facts |= _judge_masks(made, compared)
-        if "why_not" in facts:  # which does not concern the user's
+        if "why_not" in facts:  # masks that the user has edited are still used
             made = [None] * len(made)
         masks = [edited.get(name, mask) for name, mask in zip(job.names, made, strict=True)]
     facts["masked"] = any(mask is not None for mask in masks)
@@ -322,7 +322,7 @@ def _edited_masks(job: Job, tell: Tell) -> dict[str, np.ndarray]:
             try:
                 edited[name] = read_mask(path, Path(job.originals) / name) > 0
             except UserError as error:
-                tell(f"{error.message}: making it anew")
+                tell(f"{error.message}: the mask is replaced")
     return edited
 
 
@@ -331,7 +331,7 @@ def _write_masks(job: Job, masks: Sequence[np.ndarray | None], edited: Collectio
     job.mask_folder.mkdir(exist_ok=True)
     stage = Path(job.folder) / _WRITTEN
     made = [name for name, mask in zip(job.names, masks, strict=True) if mask is not None and name not in edited]
-    # What is interrupted below must be taken for ours, not for edited.
+    # If this call is interrupted, the next one must not take these masks for edited ones.
     written = (read_stage(stage, _VERSION) or {}) | {name: ["", ""] for name in made}
     write_stage(stage, _VERSION, written)
     laid_out = []
