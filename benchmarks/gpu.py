@@ -191,7 +191,7 @@ def fitting_of(capture: Path, device: Any, batch: int, log2_rows: int) -> tuple[
         samples_per_step=batch,
         log2_rows=log2_rows,
     )
-    extent = choose_extent(captured, settings, fills_frame=all(photo.pixels.shape[-1] == 3 for photo in photos))
+    extent = choose_extent(captured, settings, is_object=all(photo.pixels.shape[-1] == 4 for photo in photos))
     pool = PixelPool(photos, extent.training_from_scene, device)
     marching = extent.marching.stretched(20.0) if dry else extent.marching
     fitting = Fitting(TrainingInputs(settings, replace(extent, marching=marching), pool))

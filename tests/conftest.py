@@ -110,8 +110,8 @@ def small_photo_depths(monkeypatch: pytest.MonkeyPatch) -> None:
 def coarse_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cut rays into an eighth of the steps: after a step of training all space is fog, and pictures take seconds."""
 
-    def choose(captured: Capture, settings: TrainSettings, *, fills_frame: bool) -> Extent:
-        extent = choose_extent(captured, settings, fills_frame=fills_frame)
+    def choose(captured: Capture, settings: TrainSettings, *, is_object: bool) -> Extent:
+        extent = choose_extent(captured, settings, is_object=is_object)
         return replace(extent, marching=extent.marching.stretched(8.0))
 
     monkeypatch.setattr(preparation, "choose_extent", choose)

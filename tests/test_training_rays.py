@@ -189,7 +189,7 @@ def side_by_side(*places: float, turned: Similarity | None = None) -> list[Frame
 def test_a_narrow_baseline_is_one_below_half_of_the_nearest_depth(spread):
     scene = replace(scene_of(side_by_side(-spread, 0.0, spread)), depth_bounds=np.tile([2.0, 8.0], (3, 1)))
     assert has_narrow_baseline(scene) == (spread < 1.0)
-    extent = choose_extent(scene, TrainSettings(), fills_frame=True)
+    extent = choose_extent(scene, TrainSettings(), is_object=False)
     ball, marching = narrow_frame(scene)[:2] if spread < 1.0 else contracted_frame(scene)
     assert extent.training_from_scene.scale == ball.scale
     assert extent.marching == marching
@@ -205,7 +205,7 @@ def test_a_narrow_baseline_is_one_below_half_of_the_nearest_depth(spread):
         replace(scene_of(side_by_side(0.0, 0.0)), depth_bounds=np.array([[0.0, 8.0], [0.0, 8.0]]))
     )
     # An object on an empty background needs no depth.
-    assert choose_extent(scene, TrainSettings(), fills_frame=False).contraction == "none"
+    assert choose_extent(scene, TrainSettings(), is_object=True).contraction == "none"
 
 
 def test_narrow_captures_lie_in_contracted_space_behind_a_ball_around_the_cameras():
@@ -221,7 +221,7 @@ def test_narrow_captures_lie_in_contracted_space_behind_a_ball_around_the_camera
         assert 1 / similarity.scale == pytest.approx(2.0 * unit, rel=1e-9)
         assert marching.near == pytest.approx(0.9)  # of the nearest depth, which is 1 here
         assert background == pytest.approx(2.5 * 3.2 / 2.0)  # the harmonic mean of the bounds is 3.2
-        extent = choose_extent(scene, TrainSettings(), fills_frame=True)
+        extent = choose_extent(scene, TrainSettings(), is_object=False)
         assert extent.before("sphere", sky_known=False).marching.far == pytest.approx(background)
         assert extent.before("black", sky_known=False).marching == marching
 

@@ -31,7 +31,7 @@ def trials(spheres) -> Trials:
 
 
 def inputs_of(scene: Capture) -> TrainingInputs:
-    extent = choose_extent(scene, SETTINGS, fills_frame=False)
+    extent = choose_extent(scene, SETTINGS, is_object=True)
     photos = load_photos(scene.train_frames, factor=4, threads=1)
     return TrainingInputs(SETTINGS, extent, PixelPool(photos, extent.training_from_scene, torch.device("cpu")))
 

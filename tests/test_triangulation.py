@@ -85,15 +85,15 @@ def test_masked_parts_of_photos_give_no_points(photos):
 def test_the_unit_ball_follows_what_is_found(photos):
     """The cameras' axes meet 1 in front of them, and the wall is 3 away."""
     scene = scene_of(photos)
-    assert lacks_depth(scene, SETTINGS, fills_frame=True)
+    assert lacks_depth(scene, SETTINGS, is_object=False)
     scene = replace(scene, points=found_in(photos))
-    assert not lacks_depth(scene, SETTINGS, fills_frame=True)
-    extent = choose_extent(scene, SETTINGS, fills_frame=True)
+    assert not lacks_depth(scene, SETTINGS, is_object=False)
+    extent = choose_extent(scene, SETTINGS, is_object=False)
     assert 1.8 < 1 / extent.training_from_scene.scale < 4
     assert extent.contraction == "l2"
     near = extent.marching.near / extent.training_from_scene.scale
     assert 0.25 * WALL_Z < near < WALL_Z
-    box = choose_extent(scene, replace(SETTINGS, contraction="none"), fills_frame=True)
+    box = choose_extent(scene, replace(SETTINGS, contraction="none"), is_object=False)
     assert box.contraction == "none"
     assert str(Extent.from_json(json.loads(json.dumps(box.to_json())))) == "bounded scene"
     assert Extent.from_json(box.to_json()).marching == box.marching
@@ -103,15 +103,15 @@ def test_the_unit_ball_follows_what_is_found(photos):
 
 def test_depth_bounds_are_enough_unless_a_box_is_requested(photos):
     bounded = replace(scene_of(photos), depth_bounds=np.array([[1.0, 4.0]] * len(photos)))
-    assert not lacks_depth(bounded, SETTINGS, fills_frame=True)
-    assert lacks_depth(bounded, replace(SETTINGS, contraction="none"), fills_frame=True)
-    assert not lacks_depth(scene_of(photos), SETTINGS, fills_frame=False)  # an object in alpha
+    assert not lacks_depth(bounded, SETTINGS, is_object=False)
+    assert lacks_depth(bounded, replace(SETTINGS, contraction="none"), is_object=False)
+    assert not lacks_depth(scene_of(photos), SETTINGS, is_object=True)  # an object in alpha
 
 
 def test_nothing_is_found_in_photos_without_detail(photos):
     grey = [replace(photo, pixels=np.full_like(photo.pixels, 128)) for photo in photos]
     assert found_in(grey).shape == (0, 3)
-    extent = choose_extent(scene_of(grey), SETTINGS, fills_frame=True)
+    extent = choose_extent(scene_of(grey), SETTINGS, is_object=False)
     assert np.isfinite(extent.training_from_scene.scale)
 
 

@@ -55,7 +55,8 @@ class Evidence:
         sky_fraction: fraction of the pixels that look like a sky, see `matching.sky`; 0 if that is enough for one, but
             3D points are in front.
         sky_confirmed: whether these are enough for a sky, and 3D points are everywhere else.
-        sky: (pixels,) bool, the pixels of the pool that look like a sky; None if they are too few to be one.
+        sky: (pixels,) bool, the pixels of the pool that look like a sky; None if they are too few to be one. A plain
+            background counts as one.
         track_depths: of points from structure from motion, or of matched features.
         stereo_depths: from stereo matching.
         sensor_depths: from a sensor's maps.
@@ -104,11 +105,24 @@ class Evidence:
 
 @dataclass(frozen=True)
 class TrainingPhotos:
-    """The training photos of a scene: their pixels, and the features that they share."""
+    """The training photos of a scene.
+
+    Args:
+        album: their pixels.
+        shared: the features that they share.
+        plain: for each photo the mask (H, W) of a plain background, see `matching.plain_background`; None if there is
+            none, or if it is not to be used.
+    """
 
     scene: Capture
     album: Album
     shared: SharedFeatures
+    plain: list[np.ndarray] | None = None
+
+    @property
+    def show_object(self) -> bool:
+        """Whether they show nothing but an object, cut out by alpha or before a plain background."""
+        return not self.album.fills_frame or self.plain is not None
 
     @property
     def lacks_points(self) -> bool:
@@ -162,7 +176,7 @@ def collect_evidence(
     skies: list[np.ndarray] = []
     if wanted.background == "sphere" or (selects and "background" not in fixed and not pool.has_alpha):
         with found.timed("sky"):
-            skies = sky_masks(album, threads=threads)
+            skies = photos.plain or sky_masks(album, threads=threads)
             _find_sky(found, skies, photos, device=pool.colours.device)
 
     points_are_open = selects and may_use_points(wanted, fixed, has_alpha=pool.has_alpha, cameras=found.cameras)
@@ -311,12 +325,13 @@ def _find_sky(found: Evidence, skies: list[np.ndarray], photos: TrainingPhotos, 
     found.sky_fraction = _fraction(skies)
     if found.sky_fraction <= LEAST_SKY_FRACTION:
         return
-    # Tracks from matches would have two photos each.
-    before = points_before(skies, photos.album.photos, photos.shared.of_model)
-    if before.refute:
-        found.sky_fraction = 0.0
-        return
-    found.sky_confirmed = before.confirm
+    if photos.plain is None:
+        # Tracks from matches would have two photos each.
+        before = points_before(skies, photos.album.photos, photos.shared.of_model)
+        if before.refute:
+            found.sky_fraction = 0.0
+            return
+        found.sky_confirmed = before.confirm
     found.sky = torch.from_numpy(np.concatenate([mask.ravel() for mask in skies])).to(device)
 
 

@@ -44,6 +44,8 @@ BALL_PER_DEPTH = 0.75
 NARROW_SPREAD = 0.5
 # In such captures, the background begins at this multiple of the typical depth.
 NARROW_BACKGROUND = 2.5
+# Photos show an object and nothing else only if this part of the 3D points is around their middle; a few are wrong.
+OBJECT_PART = 0.95
 # Fewer points do not tell where a scene ends.
 LEAST_POINTS = 50
 
@@ -99,21 +101,35 @@ def narrow_frame(scene: Capture) -> tuple[Similarity, Marching, float]:
 
 
 def object_frame(scene: Capture) -> tuple[Similarity, Marching]:
-    """Return similarity and steps for photos with alpha: an object in the middle, and nothing else.
+    """Return similarity and steps for an object in the middle and nothing else.
 
     The unit ball is the smallest that fills every camera's view, and the cube around it is the whole field.
 
     Raises:
         UserError: no camera (see `Capture`).
     """
-    centre = _focus(scene, _typical_depths(scene))
+    centre, radius = _object_ball(scene)
     distances = _distances(scene, centre)
-    radius = max(d * math.tan(_half_fov(f)) for d, f in zip(distances, scene.frames, strict=True))
     reach = math.sqrt(3.0)  # the cube's corners
     near = max(float(distances.min()) / radius - reach, NEAREST)
     far = float(distances.max()) / radius + reach
     similarity = Similarity(1.0 / radius, np.eye(3), -centre / radius)
     return similarity, Marching(near=near, far=far, shortest_step=2 * reach / 512, growth=0.0)
+
+
+def fits_object_frame(scene: Capture) -> bool:
+    """Return whether nearly all 3D points are in the unit ball of `object_frame`; True if there are none."""
+    centre, radius = _object_ball(scene)
+    return len(scene.points) == 0 or bool(
+        (np.linalg.norm(scene.points - centre, axis=1) <= radius).mean() >= OBJECT_PART
+    )
+
+
+def _object_ball(scene: Capture) -> tuple[np.ndarray, float]:
+    """Return the centre and the radius of the smallest ball that fills every camera's view."""
+    centre = _focus(scene, _typical_depths(scene))
+    views = zip(_distances(scene, centre), scene.frames, strict=True)
+    return centre, max(distance * math.tan(_half_fov(frame)) for distance, frame in views)
 
 
 def box_frame(scene: Capture) -> tuple[Similarity, Marching]:
@@ -247,30 +263,31 @@ class Extent:
         return replace(self, marching=replace(self.marching, far=min(self.marching.far, self.reach)))
 
 
-def lacks_depth(scene: Capture, settings: TrainSettings, *, fills_frame: bool) -> bool:
+def lacks_depth(scene: Capture, settings: TrainSettings, *, is_object: bool) -> bool:
     """Return whether the settings need a depth that the scene lacks, so that points must be triangulated first.
 
     Args:
         scene: cameras, and points or depth bounds if it has any.
-        fills_frame: whether the photos show more than an object cut out by alpha.
+        is_object: whether the photos show nothing but an object, cut out by alpha or before a plain background.
     """
-    contraction = _contraction(settings, fills_frame)
-    is_object = contraction == "none" and not fills_frame
-    return not is_object and len(scene.points) == 0 and (scene.depth_bounds is None or contraction == "none")
+    contraction = _contraction(settings, is_object)
+    if contraction == "none" and is_object:
+        return False
+    return len(scene.points) == 0 and (scene.depth_bounds is None or contraction == "none")
 
 
-def choose_extent(scene: Capture, settings: TrainSettings, *, fills_frame: bool) -> Extent:
+def choose_extent(scene: Capture, settings: TrainSettings, *, is_object: bool) -> Extent:
     """Choose the extent for the settings.
 
     Args:
         scene: cameras, and points or depth bounds; see `lacks_depth`.
-        fills_frame: whether the photos show more than an object cut out by alpha.
+        is_object: as for `lacks_depth`.
 
     Raises:
         UserError: the requested contraction is "none", and there are too few points to tell where the scene ends.
     """
-    contraction = _contraction(settings, fills_frame)
-    if contraction == "none" and not fills_frame:
+    contraction = _contraction(settings, is_object)
+    if contraction == "none" and is_object:
         return Extent(contraction, *object_frame(scene))
     if contraction == "none":
         return Extent(contraction, *box_frame(scene))
@@ -281,8 +298,8 @@ def choose_extent(scene: Capture, settings: TrainSettings, *, fills_frame: bool)
     return Extent(contraction, similarity, marching, farthest + BALLS_BEFORE_BACKGROUND)
 
 
-def _contraction(settings: TrainSettings, fills_frame: bool) -> str:
-    return settings.contraction or ("l2" if fills_frame else "none")
+def _contraction(settings: TrainSettings, is_object: bool) -> str:
+    return settings.contraction or ("none" if is_object else "l2")
 
 
 # Detailed fields end with shorter steps, halved until they are shorter than this many cells of the finest level as seen

@@ -18,12 +18,13 @@ from nerfcli.captures.loading import refuse_without_training_photos
 from nerfcli.errors import UserError, several
 from nerfcli.machine import default_memory_limit
 from nerfcli.matching.correspondences import SharedFeatures
+from nerfcli.matching.plain_background import plain_background
 from nerfcli.matching.tracks import triangulate
 from nerfcli.photos.exif import mean_log_exposure, relative_log_exposures
 from nerfcli.training.evidence import LEARN_FOCAL, Evidence, TrainingPhotos, collect_evidence, tracks_of_model
-from nerfcli.training.extent import Extent, choose_extent, lacks_depth
+from nerfcli.training.extent import Extent, choose_extent, fits_object_frame, lacks_depth
 from nerfcli.training.fitting import TrainingInputs
-from nerfcli.training.pool import PixelPool, PointRays, load_album
+from nerfcli.training.pool import Album, PixelPool, PointRays, load_album
 from nerfcli.training.runs.components import Components, Selection
 from nerfcli.training.runs.run import RunConfig
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
@@ -74,7 +75,7 @@ def prepare(
     notify(text)
     album = load_album(scene.train_frames, factor=factor, threads=threads, storage=storage, masks=masks)
     shared = SharedFeatures(album.photos, lambda: tracks_of_model(scene, album.photos), threads=threads)
-    photos = TrainingPhotos(scene, album, shared)
+    photos = TrainingPhotos(scene, album, shared, _plain_background(scene, album, settings))
 
     if begun is not None:
         settings = replace(settings, components=begun.config.components)
@@ -116,12 +117,20 @@ def prepare(
 
 def _extent(photos: TrainingPhotos, settings: TrainSettings, *, notify: Callable[[str], None]) -> Extent:
     """Return the extent of the field; without 3D points, from triangulated ones if it needs any."""
-    scene, fills_frame = photos.scene, photos.album.fills_frame
-    if lacks_depth(scene, settings, fills_frame=fills_frame):
+    scene, is_object = photos.scene, photos.show_object
+    if lacks_depth(scene, settings, is_object=is_object):
         frames = [photo.frame for photo in photos.album.photos]
         scene = replace(scene, points=triangulate(frames, photos.shared.of_matches).found)
         notify(f"the scene has no 3D points; estimating its extent from {len(scene.points)} triangulated ones")
-    return choose_extent(scene, settings, fills_frame=fills_frame)
+    return choose_extent(scene, settings, is_object=is_object)
+
+
+def _plain_background(scene: Capture, album: Album, settings: TrainSettings) -> list[np.ndarray] | None:
+    """Return the masks of a plain background around an object; None if there is none, or the background is set."""
+    is_open = settings.model == "auto" and "background" not in settings.fixed
+    if not (is_open or settings.components.background == "sphere") or not fits_object_frame(scene):
+        return None
+    return plain_background(album.photos)
 
 
 def _decide(
@@ -182,6 +191,7 @@ def _facts(photos: TrainingPhotos, settings: TrainSettings, evidence: Evidence) 
         sensor=sensor,
         sky_fraction=evidence.sky_fraction,
         sky_confirmed=evidence.sky_confirmed,
+        is_plain=photos.plain is not None,
         occluded_fraction=evidence.occluded_fraction,
         photos=len(exif),
         exposure_spread=evidence.exposure_spread,

@@ -52,6 +52,7 @@ class Facts:
         sensor: number of pixels with a depth from a sensor.
         sky_fraction: fraction of the pixels that look like a sky, see `matching.sky`.
         sky_confirmed: whether 3D points confirm that it is one.
+        is_plain: whether it is a plain background around an object.
         occluded_fraction: fraction of the pixels where something hides a surface that other photos see.
         photos: number of training photos.
         exposure_spread: standard deviation of the photos' brightness at points that they share, in logarithms of light.
@@ -68,6 +69,7 @@ class Facts:
     sensor: int = 0
     sky_fraction: float = 0.0
     sky_confirmed: bool = False
+    is_plain: bool = False
     occluded_fraction: float = 0.0
     photos: int = 0
     exposure_spread: float = 0.0
@@ -133,8 +135,9 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
             wanted.append((("exposure", "matched" if facts.photos <= FEW_PHOTOS else "learned"), reason))
     if facts.sensor:
         wanted.append((("sensor", True), f"a sensor has measured the depth of {facts.sensor:,} pixels"))
-    if facts.sky_confirmed:
-        reason = f"{100.0 * facts.sky_fraction:.0f} % of the pixels look like a sky, with hardly any 3D point in front"
+    if facts.sky_confirmed or facts.is_plain:
+        kind = "are a plain background" if facts.is_plain else "look like a sky, with hardly any 3D point in front"
+        reason = f"{100.0 * facts.sky_fraction:.0f} % of the pixels {kind}"
         wanted.append((("background", "sphere"), reason))
     wanted = [(change, reason) for change, reason in wanted if change[0] not in facts.fixed]
     values: dict[str, Any] = dict(change for change, _ in wanted)
