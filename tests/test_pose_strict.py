@@ -18,6 +18,8 @@ from nerfcli.cameras.alignment import align
 from nerfcli.captures.loading import load_scene
 from nerfcli.evaluate.ledger import leak_ledger
 from nerfcli.poses.engine import worker
+from nerfcli.poses.engine.database import register_photos
+from nerfcli.poses.engine.mapping import MappedModels
 from nerfcli.poses.engine.strict import move_held_out_last, place_held_out, training_part
 from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.poses.input.settings import PoseSettings
@@ -116,6 +118,21 @@ def test_the_scene_records_what_was_held_out_and_how(solved):
     assert not is_same_scene(scene_dir, photos, replace(settings, strict=False))
     Path(settings.holdout).write_text(NAMES[0])
     assert not is_same_scene(scene_dir, photos, settings)
+
+
+def test_a_held_out_photo_is_placed_with_the_features_of_the_model(solved, tmp_path, monkeypatch):
+    """Regression: the features of a model that took an attempt with larger pictures were taken for the first ones."""
+    map_photos = worker._map
+
+    def map_with_larger_pictures(job: Job, *others: Any, **more: Any) -> MappedModels:
+        register_photos(job)  # as the first attempts do
+        return map_photos(replace(job, variant="full-size", max_image_size=480), *others, **more)
+
+    monkeypatch.setattr(worker, "_map", map_with_larger_pictures)
+    (tmp_path / "test.txt").write_text(NAMES[HELD_OUT])
+    with training_model_kept(tmp_path):
+        poses_in_this_process(solved[0], tmp_path / "scene", replace(solved[2], holdout=str(tmp_path / "test.txt")))
+    assert assert_added(tmp_path, NAMES[HELD_OUT]) == {"pose"}
 
 
 def job_of_five() -> Job:

@@ -50,16 +50,17 @@ def training_part(job: Job) -> Job:
     )
 
 
-def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Report) -> dict[str, Any]:
+def place_held_out(job: Job, mapped: Job, result: dict[str, Any], report: Report) -> dict[str, Any]:
     """Place the held-out photos of a job in the model of its training photos, and add them to the model on disk.
 
-    Returns the worker's result for `training`, the `training_part` of the job, as one for all photos, with "strict":
-    how each held-out photo was placed.
+    Returns the worker's result for `mapped`, the `training_part` of the job with the features and lenses of the model,
+    as one for all photos, with "strict": how each held-out photo was placed.
     """
     folder = Path(job.folder) / "sparse" / "0"
-    whole = _renumbered(job, training, result)
+    whole = _renumbered(job, mapped, result)
     if not result["models"]:
         return whole | {"left_out": {str(number): NO_MODEL for number in job.held_out}}
+    job = _with_features_and_lenses(job, mapped)
     extract(job, report)
     job = select_pairs(job, report)
     held_out = frozenset(job.held_out)
@@ -156,6 +157,18 @@ def _seen_points(
     pixels = features[[feature for feature, _ in rows]] if rows else np.zeros((0, 2))
     points = np.array([model.point3D(point).xyz for _, point in rows]).reshape(-1, 3)
     return pixels, points
+
+
+def _with_features_and_lenses(job: Job, mapped: Job) -> Job:
+    """Return the job with the features and lenses of a job of its training photos."""
+    lenses = [replace(used, photos=group.photos) for used, group in zip(mapped.groups, job.groups, strict=False)]
+    return replace(
+        job,
+        variant=mapped.variant,
+        max_image_size=mapped.max_image_size,
+        max_features=mapped.max_features,
+        groups=(*lenses, *job.groups[len(lenses) :]),  # cameras without a training photo are the last ones
+    )
 
 
 def _renumbered(job: Job, training: Job, result: Mapping[str, Any]) -> dict[str, Any]:

@@ -207,11 +207,11 @@ def solve(job: Job, report: Report, tell: Tell) -> None:
     job, moving = _mask_object(job, report, tell, seconds=seconds) if stored is None else stored
     if moving is not None and moving["found"]:
         tell(describe_motions(moving))
-    training = training_part(job) if job.held_out else job
-    result = _estimate(training, report, tell)
+    result = _estimate(training_part(job) if job.held_out else job, report, tell)
+    mapped: Job = result.pop("job")
     if job.held_out:
         with _timed(result["seconds"], "place"):
-            result = place_held_out(job, training, result, report)
+            result = place_held_out(job, mapped, result, report)
         result["model_files"] = model_keys(job)  # these now contain the held-out photos
     for stage, value in seconds.items():
         result["seconds"][stage] = round(result["seconds"].get(stage, 0.0) + value, 3)
@@ -226,13 +226,13 @@ def result_key(job: Job) -> str:
 
 
 def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
-    """Map the photos, refine and accept a model, write it, and return the data for the report."""
+    """Map the photos, refine and accept a model, write it, and return the data for the report and "job", as mapped."""
     seconds = {"extract": 0.0, "match": 0.0, "map": 0.0, "check": 0.0}
     mapped = _map(job, report, tell, seconds=seconds)
     checks = partial(_checks, job)
     with _timed(seconds, "check"):
         chosen = choose_model(mapped, report, tell, checks=checks)
-    result = describe_result(chosen, job) | {"seconds": seconds, "model_files": {}}
+    result = describe_result(chosen, job) | {"seconds": seconds, "model_files": {}, "job": chosen.mapped.job}
     model, uncertainty = chosen.examined.model, chosen.examined.uncertainty
     if model is None:
         return result
