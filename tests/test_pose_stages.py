@@ -289,10 +289,15 @@ def test_a_disk_that_is_full_when_a_scene_is_replaced_leaves_the_earlier_one(
 
 
 @pytest.mark.usefixtures("same_process")
-def test_a_split_that_holds_out_no_placed_photo_leaves_an_earlier_scene(photos: Path, again: Path, tmp_path: Path):
+@pytest.mark.parametrize(
+    ("strict", "said"), [(False, "holds out 0 of 7 photos"), (True, "^0 of 1 held-out photo could be placed")]
+)
+def test_a_split_that_holds_out_no_placed_photo_leaves_an_earlier_scene(
+    photos: Path, again: Path, tmp_path: Path, strict: bool, said: str
+):
     (tmp_path / "test.txt").write_text("wall.png")
-    with pytest.raises(UserError, match=r"holds out 0 of 7 photos") as refused:
-        estimate(photos, again, replace(ONE_THREAD, holdout=str(tmp_path / "test.txt")))
+    with pytest.raises(UserError, match=said) as refused:
+        estimate(photos, again, replace(ONE_THREAD, holdout=str(tmp_path / "test.txt"), strict=strict))
     assert f"details are in {again / 'work' / 'poses_report.json'}" in (refused.value.hint or "")
     images = json.loads((again / "work" / "poses_report.json").read_text())["images"]
     assert [image["name"] for image in images if image["reason"]] == ["wall.png"]

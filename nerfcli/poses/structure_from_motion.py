@@ -235,6 +235,11 @@ def _split(report: PosesReport) -> dict[str, str | None]:
     placed = [image.name for image in report.images if image.registered]
     if report.strict is not None:
         test = frozenset(report.strict["placed"])
+        if not test:
+            raise UserError(
+                f"0 of {several(len(report.strict['held_out']), 'held-out photo')} could be placed",
+                "hold out photos that overlap with training photos, see --holdout",
+            )
     else:
         test = names_held_out(report.settings.holdout, placed, others=[image.name for image in report.images])
     return {name: "test" if name in test else "train" for name in placed}
