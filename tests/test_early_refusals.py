@@ -89,6 +89,8 @@ def test_json_nested_too_deeply_is_refused_and_not_a_traceback(tmp_path):
             marks=pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such names"),
         ),
         ("photos.zip", ("--masks", "nowhere"), "the mask folder {0}/nowhere does not exist"),
+        ("clip.mp4", ("--pairs", "nowhere"), "cannot read the pairs in {0}/nowhere: No such file"),
+        ("photos.zip", ("--intrinsics", "nowhere"), "nowhere does not exist"),
     ],
 )
 def test_poses_neither_reads_a_video_nor_unpacks_photos_for_a_scene_that_is_refused(
@@ -99,6 +101,13 @@ def test_poses_neither_reads_a_video_nor_unpacks_photos_for_a_scene_that_is_refu
     result = nerfcli("poses", name, *options)
     assert (result.exit_code, error_of(result)[0]) == (BAD_INPUT, f"Error: {said.format(tmp_path)}")
     assert list(tmp_path.iterdir()) == [tmp_path / name]
+
+
+def test_run_does_not_read_a_video_if_there_are_no_intrinsics(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("clip.mp4").write_bytes(b"x")
+    assert error_of(nerfcli("run", "clip.mp4", "--intrinsics", "nowhere"))[0] == "Error: nowhere does not exist"
+    assert list(tmp_path.iterdir()) == [tmp_path / "clip.mp4"]
 
 
 @pytest.mark.parametrize("name", ["clip.mp4", "photos.zip"])

@@ -59,6 +59,8 @@ def estimate_poses(
     if source.is_file() and (output.overwrite or not (target / SCENE_FILE).exists()):
         # Before its files or frames are written.
         check_settings(settings)
+        if intrinsics is not None and not Path(intrinsics).exists():
+            raise UserError(f"{intrinsics} does not exist", "give a file with intrinsics of the cameras")
         check_destination(target, folder, subfolders=settings.subfolders)
     if is_archive(source):
         files = unpacked(source, Output(target, output.overwrite), reporter=reporter)

@@ -71,11 +71,11 @@ def for_panoramas(settings: PoseSettings) -> PoseSettings:
 
 
 def check_settings(settings: PoseSettings) -> None:
-    """Refuse values that would crash pycolmap, and a folder of masks that does not exist.
+    """Refuse values that would crash pycolmap, and a folder of masks or a file of pairs that does not exist.
 
     Raises:
         ValueError: a setting is out of its range.
-        UserError: there is no such folder.
+        UserError: there is no such folder or file.
     """
     if settings.max_image_size < 1 or settings.max_features < 1:
         raise ValueError(
@@ -90,3 +90,6 @@ def check_settings(settings: PoseSettings) -> None:
     if settings.masks is not None and not Path(settings.masks).is_dir():
         hint = "give a folder with a mask for each photo"
         raise UserError(f"the mask folder {settings.masks} does not exist", hint)
+    if settings.pairs_file is not None and not Path(settings.pairs_file).exists():
+        hint = "give a text file with two names per line"
+        raise UserError(f"cannot read the pairs in {settings.pairs_file}: No such file", hint)
