@@ -369,6 +369,22 @@ class TestPoses:
         said = "no masks of the rest could be created, because they would cover 100.0 % of a photo"
         assert (said in describe_motions(facts)) == (first > 0)
 
+    @pytest.mark.parametrize("found", [True, False])
+    def test_an_edited_mask_that_does_not_fit_is_neither_used_nor_lost(
+        self, job: Job, monkeypatch: pytest.MonkeyPatch, found: bool
+    ) -> None:
+        """Regression: it was overwritten, or removed if no mask was found for its photo any more."""
+        make, path = module._make_masks, scene_masks(job) / f"{job.names[0]}.png"
+        Image.new("1", (240, 180), 1).save(path)
+        edited, notes = path.read_bytes(), list[str]()
+        if not found:
+            monkeypatch.setattr(module, "_make_masks", lambda *some, **more: [None, *make(*some, **more)[1:]])
+        masked, _ = mask_turning_object(job, notes.append)
+        assert (masked.masks[0].used_fraction < 1) == found
+        assert path.exists() == found
+        assert (path.parent / f"unusable-{path.name}").read_bytes() == edited
+        assert sum("240x180" in note and f"it is now unusable-{path.name}" in note for note in notes) == 1
+
     def test_masks_of_a_run_that_was_interrupted_are_not_taken_for_edited_ones(self, job: Job) -> None:
         expected = mask_turning_object(job, lambda note: None)[0].masks
         with pytest.MonkeyPatch.context() as patched:

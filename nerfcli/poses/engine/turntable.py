@@ -313,7 +313,10 @@ def _judge_masks(masks: Sequence[np.ndarray | None], pairs: Sequence[ComparedPai
 
 
 def _edited_masks(job: Job, tell: Tell) -> dict[str, np.ndarray]:
-    """Return the masks, by the photo's name, that the user has changed since they were written for this photo."""
+    """Return the masks, by the photo's name, that the user has changed since they were written for this photo.
+
+    Those that cannot be read or do not fit are renamed.
+    """
     written, edited = read_stage(Path(job.folder) / _WRITTEN, _VERSION) or {}, {}
     for name, key in zip(job.names, job.keys, strict=True):
         path = scene_masks(job) / f"{name}.png"
@@ -322,7 +325,9 @@ def _edited_masks(job: Job, tell: Tell) -> dict[str, np.ndarray]:
             try:
                 edited[name] = read_mask(path, Path(job.originals) / name) > 0
             except UserError as error:
-                tell(f"{error.message}: the mask is replaced")
+                unusable = path.with_name(f"unusable-{path.name}")
+                path.replace(unusable)
+                tell(f"{error.message}: it is now {unusable.name}, and is not used")
     return edited
 
 
