@@ -24,7 +24,7 @@ from nerfcli.errors import UserError
 from nerfcli.matching.stationary import Motions, Stationary, motions, still_px, together
 from nerfcli.pages.findings import LOOK
 from nerfcli.poses.engine import turntable as module
-from nerfcli.poses.engine.turntable import add_advice, describe_motions, mask_turning_object, scene_masks
+from nerfcli.poses.engine.turntable import add_advice, describe_motions, mask_turning_object, recall_masks, scene_masks
 from nerfcli.poses.input import still_background as still
 from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.poses.input.settings import PoseSettings
@@ -384,6 +384,26 @@ class TestPoses:
         assert path.exists() == found
         assert (path.parent / f"unusable-{path.name}").read_bytes() == edited
         assert sum("240x180" in note and f"it is now unusable-{path.name}" in note for note in notes) == 1
+
+    def test_a_mask_that_the_user_made_for_a_photo_that_got_none_is_used_and_kept(
+        self, job: Job, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Regression: only training used it, and it was overwritten when a mask was found."""
+        make, path = module._make_masks, scene_masks(job) / f"{job.names[0]}.png"
+        with monkeypatch.context() as patched:
+            patched.setattr(module, "_make_masks", lambda *some, **more: [None, *make(*some, **more)[1:]])
+            mask_turning_object(job, lambda note: None)
+        own = np.zeros((360, 480), bool)
+        own[100:200] = True
+        Image.fromarray(own).save(path)
+        drawn = path.read_bytes()
+        recalled = recall_masks(job)
+        assert recalled is not None
+        for used, facts in (recalled, mask_turning_object(job, lambda note: None)):
+            assert facts is not None
+            assert facts["unmasked"] == []
+            assert used.masks[0].used_fraction == own.mean()
+            assert path.read_bytes() == drawn
 
     def test_masks_of_a_run_that_was_interrupted_are_not_taken_for_edited_ones(self, job: Job) -> None:
         expected = mask_turning_object(job, lambda note: None)[0].masks

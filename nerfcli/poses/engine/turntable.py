@@ -113,12 +113,13 @@ def recall_masks(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
         return None
     if not content or not content["masked"]:
         return job, content or None
-    masks = []
+    unmasked = [name for name in content["unmasked"] if not (scene_masks(job) / f"{name}.png").is_file()]
+    masks, content = [], content | {"unmasked": unmasked}
     for name, file in zip(job.names, job.files, strict=True):
         photo, mask = Path(job.originals) / name, scene_masks(job) / f"{name}.png"
         target = job.mask_folder / f"{file}.png"
         target.parent.mkdir(exist_ok=True)
-        if name in content["unmasked"]:
+        if name in unmasked:
             masks.append(write_no_mask(target, image_size(job.photos / file)))
             continue
         try:
@@ -315,12 +316,12 @@ def _judge_masks(masks: Sequence[np.ndarray | None], pairs: Sequence[ComparedPai
 def _edited_masks(job: Job, tell: Tell) -> dict[str, np.ndarray]:
     """Return the masks, by the photo's name, that the user has changed since they were written for this photo.
 
-    Those that cannot be read or do not fit are renamed.
+    Those of photos that got none are the user's too. Those that cannot be read or do not fit are renamed.
     """
     written, edited = read_stage(Path(job.folder) / _WRITTEN, _VERSION) or {}, {}
     for name, key in zip(job.names, job.keys, strict=True):
         path = scene_masks(job) / f"{name}.png"
-        photo_key, mask_key = written.get(name, ("", ""))
+        photo_key, mask_key = written.get(name, (key, "") if written else ("", ""))
         if key == photo_key and path.is_file() and file_key(path) != mask_key:
             try:
                 edited[name] = read_mask(path, Path(job.originals) / name) > 0
