@@ -12,6 +12,7 @@ import pycolmap
 import pytest
 from corner import CENTRES, NAMES, cam_from_world, write_capture
 from in_this_process import poses_in_this_process
+from PIL import Image
 from test_poses import FAST
 
 from nerfcli.cameras.alignment import align
@@ -35,7 +36,9 @@ HELD_OUT = 2  # in the middle, and stored upright
 def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, PoseSettings, PosesReport]:
     folder = tmp_path_factory.mktemp("strict")
     write_capture(folder / "photos")
-    (folder / "test.txt").write_text(f"{NAMES[HELD_OUT]}\nwall.png\n")
+    for number in range(2):
+        Image.new("RGB", (300, 200), (200, 200, 200)).save(folder / "photos" / f"other camera {number}.png")
+    (folder / "test.txt").write_text(f"{NAMES[HELD_OUT]}\nwall.png\nother camera 1.png\n")
     settings = replace(FAST, max_features=300, max_image_size=320, strict=True, holdout=str(folder / "test.txt"))
     with training_model_kept(folder):
         report = poses_in_this_process(folder / "photos", folder / "scene", settings)
@@ -108,10 +111,11 @@ def test_the_scene_records_what_was_held_out_and_how(solved):
     photos, scene_dir, settings, report = solved
     images = {image.name: image for image in report.images}
     assert images["wall.png"].reason == "matches too few points of the training photos (0 inliers of 0)"
-    assert (report.registered, report.total) == (7, 9)
+    assert images["other camera 1.png"].reason == "held out, and no training photo of its camera registered"
+    assert (report.registered, report.total) == (7, 11)
     loaded = load_scene(scene_dir)
     assert loaded.test_names == {NAMES[HELD_OUT]}
-    assert (loaded.provenance["registered"], loaded.provenance["total"]) == (7, 9)
+    assert (loaded.provenance["registered"], loaded.provenance["total"]) == (7, 11)
     ledger = {entry.stage: entry.saw_held_out for entry in leak_ledger(RunConfig(history=loaded.provenance))}
     assert (ledger["poses"], ledger["intrinsics"], ledger["points"]) == (False, False, False)
     assert is_same_scene(scene_dir, photos, settings)

@@ -20,7 +20,7 @@ from nerfcli.poses.input.job import Job, Report
 from nerfcli.poses.model.held_out import MAPPER
 from nerfcli.poses.model.locate import place
 from nerfcli.poses.model.principal_points import LEAST_OBSERVATIONS, camera_of_lens, refine_with_principal_point
-from nerfcli.poses.model.reasons import FEW_MATCHES, NO_MODEL, NO_TRAINING_PHOTO
+from nerfcli.poses.model.reasons import FEW_MATCHES, NO_LENS, NO_MODEL, NO_TRAINING_PHOTO
 
 
 def move_held_out_last(job: Job) -> Job:
@@ -105,7 +105,7 @@ def _place(
     training = [job.image_ids[photo] for photo in group.photos if photo not in job.held_out]
     placed = [image_id for image_id in training if model.exists_image(image_id)]
     if not placed:
-        return NO_TRAINING_PHOTO
+        return NO_LENS if training else NO_TRAINING_PHOTO
     camera = camera_of_lens(model, placed)
     pixels, points = _seen_points(model, job, number, pairs)
     options = pycolmap.AbsolutePoseEstimationOptions()

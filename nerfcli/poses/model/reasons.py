@@ -11,8 +11,9 @@ FEW_MATCHES = 30
 MIN_MATCHES = 15
 # A held-out photo is placed with the lens that the training photos of its camera gave.
 NO_TRAINING_PHOTO = "its camera took no training photo"
-# Not a cause, so that `dominant` does not count it: the training photos have their reasons.
+# Not causes, so that `dominant` does not count them: the training photos have their reasons.
 NO_MODEL = "held out, and no training photo registered"
+NO_LENS = "held out, and no training photo of its camera registered"
 
 
 def reason(
