@@ -152,16 +152,15 @@ def mask_turning_object(job: Job, tell: Tell) -> tuple[Job, dict[str, Any] | Non
         "found": motions.found,
     }
     masks: list[np.ndarray | None] = [None] * len(job.files)
-    edited: dict[str, np.ndarray] = {}
+    edited: Collection[str] = ()
     if motions.found:
         tell("the object turns in front of a background that does not, as on a turntable: making masks of it")
-        edited, made = _edited_masks(job, tell), _make_masks(photos, training, others=job.held_out)
-        facts |= _judge_masks(made, compared)
+        edited, masks = _edited_masks(job, tell), _make_masks(photos, training, others=job.held_out)
+        facts |= _judge_masks(masks, compared)
         if "why_not" in facts:  # masks that the user has edited are still used
-            made = [None] * len(made)
-        masks = [edited.get(name, mask) for name, mask in zip(job.names, made, strict=True)]
-    facts["masked"] = any(mask is not None for mask in masks)
-    facts["unmasked"] = [name for name, mask in zip(job.names, masks, strict=True) if mask is None]
+            masks = [None] * len(masks)
+    unmasked = [name for name, mask in zip(job.names, masks, strict=True) if mask is None and name not in edited]
+    facts |= {"masked": len(unmasked) < len(masks), "unmasked": unmasked}
     if facts["masked"]:
         job = replace(job, masks=_write_masks(job, masks, edited))
     write_stage(Path(job.folder) / _STAGE, _key(job), facts)
@@ -313,18 +312,19 @@ def _judge_masks(masks: Sequence[np.ndarray | None], pairs: Sequence[ComparedPai
     return facts
 
 
-def _edited_masks(job: Job, tell: Tell) -> dict[str, np.ndarray]:
-    """Return the masks, by the photo's name, that the user has changed since they were written for this photo.
+def _edited_masks(job: Job, tell: Tell) -> set[str]:
+    """Return the names of the photos whose masks the user has changed since they were written for this photo.
 
     Those of photos that got none are the user's too. Those that cannot be read or do not fit are renamed.
     """
-    written, edited = read_stage(Path(job.folder) / _WRITTEN, _VERSION) or {}, {}
+    written, edited = read_stage(Path(job.folder) / _WRITTEN, _VERSION) or {}, set[str]()
     for name, key in zip(job.names, job.keys, strict=True):
         path = scene_masks(job) / f"{name}.png"
         photo_key, mask_key = written.get(name, (key, "") if written else ("", ""))
         if key == photo_key and path.is_file() and file_key(path) != mask_key:
             try:
-                edited[name] = read_mask(path, Path(job.originals) / name) > 0
+                read_mask(path, Path(job.originals) / name)
+                edited.add(name)
             except UserError as error:
                 unusable = path.with_name(f"unusable-{path.name}")
                 path.replace(unusable)
@@ -344,17 +344,19 @@ def _write_masks(job: Job, masks: Sequence[np.ndarray | None], edited: Collectio
     for name, file, key, mask in zip(job.names, job.files, job.keys, masks, strict=True):
         size, target = image_size(job.photos / file), job.mask_folder / f"{file}.png"
         path = scene_masks(job) / f"{name}.png"
+        if name in edited:
+            laid_out.append(write_mask(target, read_mask(path, Path(job.originals) / name) > 0))
+            continue
         if mask is None:
             laid_out.append(write_no_mask(target, size))
             photo_key, mask_key = written.pop(name, (None, None))
             if path.is_file() and (photo_key in ("", key) or file_key(path) == mask_key):  # training would use it
                 path.unlink()
             continue
-        if name not in edited:
-            mask = still.enlarged(mask, size)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(mask).save(path)
-            written[name] = [key, file_key(path)]
+        mask = still.enlarged(mask, size)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(mask).save(path)
+        written[name] = [key, file_key(path)]
         laid_out.append(write_mask(target, mask))
     write_stage(stage, _VERSION, written)
     return tuple(laid_out)
