@@ -127,6 +127,19 @@ def test_the_missing_wedge_is_named(beam: str, span: float, missing: float, verd
     assert ("is missing, ray directions" in found.summary) == (missing > 0)
 
 
+def test_empty_projections_are_no_air_and_no_views() -> None:
+    """Regression: line integrals of 0 in place of 60 of 96 views hid the missing wedge and a bad column."""
+    usable = np.ones((VIEWS, 1, 1), bool)
+    usable[36:] = False
+    cut = replace(scan_of_phantom(phantom_circle(views=VIEWS, columns=COLUMNS), phantom=SOLID), usable=usable)
+    half = replace(scan(span_deg=180, beam="parallel"), usable=usable)
+    assert finding("open beam", half).verdict == "good"
+    wedge = finding("missing wedge", half)
+    assert (wedge.verdict, wedge.number) == ("bad", pytest.approx(180 * 60 / VIEWS, abs=4))
+    bright = np.where(np.arange(COLUMNS) == 20, 0.9, 1.0)
+    assert finding("rings", changed(cut, lambda values: values * bright)).verdict == "bad"
+
+
 def test_too_few_views_for_the_detector() -> None:
     found = finding("number of views", scan_of_phantom(phantom_circle(views=24, columns=64)))
     assert found.verdict == "look"

@@ -53,8 +53,8 @@ class Sample:
 def sample_of(scan: Scan) -> Sample:
     """Prepare a scan for its checks."""
     rows = np.unique(np.linspace(0, scan.geometry.rows - 1, min(MOST_ROWS, scan.geometry.rows)).round().astype(int))
-    count = scan.geometry.views
-    views = np.unique(np.linspace(0, count - 1, min(MOST_VIEWS, count)).round().astype(int))
+    live = scan.live_views
+    views = live[np.unique(np.linspace(0, len(live) - 1, min(MOST_VIEWS, len(live))).round().astype(int))]
     integrals = np.stack([scan.only_rows(row, row + 1).line_integrals(views)[:, 0] for row in rows.tolist()], axis=1)
     second = np.abs(np.diff(integrals, 2, axis=2)) if integrals.shape[2] > 4 else np.zeros_like(integrals)
     inner = integrals[..., 1:-1] if integrals.shape[2] > 4 else integrals
@@ -261,7 +261,7 @@ def repeated_angles(sample: Sample) -> Finding | str:
 
 def missing_wedge(sample: Sample) -> Finding | str:
     """Find the directions that no ray covers."""
-    geometry = sample.scan.geometry
+    geometry = sample.scan.geometry.select(sample.scan.live_views)
     angles = _angles(geometry)
     if angles is None:
         return "the views are not on one circle"

@@ -103,7 +103,7 @@ def page_html(diagnosis: ScanDiagnosis, source: Path) -> str:
     sinogram = sample.integrals[:, middle]
     pictures = [("Sinogram", f"line integrals of row {int(sample.rows[middle])}, a line per view", sinogram)]
     if sample.scan.geometry.rows > 1:
-        first = sample.scan.line_integrals(np.array([0]))[0]
+        first = sample.scan.line_integrals(sample.scan.live_views[:1])[0]
         pictures.insert(0, ("First projection", "line integrals", first))
     body = pages.rendered(
         "scan.html",
