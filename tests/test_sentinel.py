@@ -62,6 +62,13 @@ def test_steps_that_are_too_large_end_with_exit_5_and_a_file_that_repeats_the_fa
     assert bad.name == "colour of samples"
     assert bad.name in description["message"]
     assert f"{bad.count} of {bad.total}" in description["message"]
+    # Regression: a traceback for failures on a GPU, whose generators have a state of 16 bytes.
+    tensors, content = load_tensors(tmp_path / "run" / "failure-2.safetensors", "cpu")
+    of_gpu = {name: torch.zeros(16, dtype=torch.uint8) for name in ("generator", "batch.after_draw")}
+    save_tensors(tmp_path / "gpu.safetensors", tensors | of_gpu, content)
+    bad = replay(tmp_path / "gpu.safetensors")[1]
+    assert bad is not None
+    assert bad.name == "colour of samples"
     assert not (tmp_path / "run" / "field.safetensors").exists()
 
 
