@@ -186,6 +186,18 @@ def test_residuals_are_those_of_the_open_beam_of_each_view(tmp_path: Path) -> No
         assert np.abs(beside.mean(axis=(1, 2))).max() < 1.0
 
 
+def test_a_scan_without_held_out_views_is_evaluated(tmp_path: Path) -> None:
+    """Regression: a traceback where the open beam was corrected."""
+    save_scan(tmp_path / "scan", scan_of(cone(9, rows=2, columns=8, pixel=4.0)))
+    fixed = ("--passes", "1", "--centre", "0", "--tilt", "0", "--air", "measured")
+    code, _, err = call("train", tmp_path / "scan", *fixed)
+    assert code == 0, err
+    assert load_reconstruction(tmp_path / "scan-run").used["air"] is not None
+    code, out, err = call("evaluate", tmp_path / "scan-run", "--json")
+    assert code == 0, err
+    assert json.loads(out.splitlines()[-1])["methods"]["nerfcli"]["projections"] is None
+
+
 def test_resume_goes_on_from_the_volume(bean_run: Path, tmp_path: Path) -> None:
     scan, run = bean_run.with_name("bean"), tmp_path / "run"
     fixed = ("--centre", "0", "--tilt", "0", "--tv", "1", "-o", run)

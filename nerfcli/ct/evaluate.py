@@ -165,9 +165,9 @@ def _reference_of(run: Path, unit: str) -> Reconstruction:
 def held_out_air(scan: Scan, geometry: ScanGeometry, result: Reconstruction) -> np.ndarray | None:
     """Estimate the factor on the open beam of each held-out view from its pixels beside the object, as in the fit.
 
-    None if the reconstruction did not use such factors.
+    None if the reconstruction did not use such factors, or no view is held out.
     """
-    if result.used.get("air") is None:
+    if result.used.get("air") is None or not scan.held_out:
         return None
     views = np.array(scan.held_out, dtype=int)
     likelihood = likelihood_of(scan, views)
