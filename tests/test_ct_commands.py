@@ -220,6 +220,18 @@ def test_resume_goes_on_from_the_volume(bean_run: Path, tmp_path: Path) -> None:
         assert (run / "reconstruction.json").read_bytes() == before
 
 
+def test_resume_keeps_the_settings_that_are_not_given(bean_run: Path, tmp_path: Path) -> None:
+    """Regression: it was refused unless all of them were given again."""
+    again = ("train", bean_run.with_name("bean"), "-o", tmp_path / "run", "--passes")
+    assert call(*again, "1", "--voxel-size", "3", "--tv", "0.5", "--centre", "0", "--tilt", "0")[0] == 0
+    code, _, err = call(*again, "2", "--resume")
+    assert code == 0, err
+    result = load_reconstruction(tmp_path / "run")
+    assert (result.passes, result.settings.strength, result.settings.voxel_size) == (2, 0.5, 3.0)
+    code, _, err = call(*again, "3", "--resume", "--tv", "2")
+    assert (code, "it differs in --tv\n" in err) == (3, True), err
+
+
 def test_an_interrupted_fit_is_not_complete_and_resume_goes_on_from_it(bean_run: Path, tmp_path: Path) -> None:
     """Regression: the same command kept it as complete, and SIGTERM ended with the code of Ctrl-C."""
     scan, run, notes = bean_run.with_name("bean"), tmp_path / "run", list[str]()

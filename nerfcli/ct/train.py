@@ -73,8 +73,8 @@ def train_scan(
         scan: a folder that `nerfcli ct convert` wrote.
         output: the folder to write, SCAN-run by default.
         settings: budget, and values that are not to be estimated from the scan.
-        resume: continue from the volume in the folder, whose settings other than totals are the same; start from the
-            beginning if there is none.
+        resume: continue from the volume in the folder, with its own settings but for totals, where those given are
+            defaults or the same; start from the beginning if there is none.
 
     Raises:
         UserError: the scan cannot be read, or the folder holds something else, or an interrupted fit without `resume`.
@@ -98,6 +98,10 @@ def train_scan(
         )
     earlier = load_reconstruction(run) if is_reconstruction(run) and not output.overwrite else None
     if earlier is not None:
+        if resume:  # with its own settings; a default counts as not given
+            given, usual = vars(settings), vars(ReconstructionSettings(passes=1))
+            own = {name: vars(earlier.settings)[name] for name in _FIXED if given[name] == usual[name]}
+            settings = replace(settings, **own)
         if reason := _reason_to_keep(run, earlier, loaded.digest, settings, resume=resume):
             again = "give a larger --budget or --passes" if resume else "add --overwrite to fit again"
             reporter.note(f"{run} is kept: {reason}; {again}")
