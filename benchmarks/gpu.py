@@ -216,7 +216,7 @@ def same_losses(capture: Path, device: Any, sizes: Sizes) -> dict[str, float]:
         for step in range(6):
             fitting.advance(0.3 + 0.1 * step)
             fitting.settle()
-            losses[-1].append(fitting.loss)
+            losses[-1].append(sum(fitting.losses.values()))
     apart = [abs(fast - exact) / exact for fast, exact in zip(*losses, strict=True)]
     if max(apart) > 1e-2:
         raise RuntimeError(f"losses {losses[0]} instead of {losses[1]}")
@@ -268,9 +268,8 @@ def pictures(capture: Path, device: Any, sizes: Sizes) -> dict[str, float]:
     fitting, frame_of_training = fitting_of(capture, device, sizes.batches[len(sizes.batches) // 2], sizes.log2_rows[0])
     for _ in range(sizes.warm_up_steps):
         fitting.advance(0.5)
-    model = Model(
-        fitting.field, fitting.cells.coarse, fitting.marching, (1.0, 1.0, 1.0), frame_of_training, unit="arbitrary"
-    )
+    steps = fitting.ray_steps.render_steps(fitting.plan.stride)
+    model = Model(fitting.field, fitting.cells.coarse, steps, (1.0, 1.0, 1.0), frame_of_training, unit="arbitrary")
     from nerfcli.captures.loading import load_scene
 
     frame = load_scene(capture).train_frames[0]
