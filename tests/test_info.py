@@ -24,6 +24,7 @@ from nerfcli.render.files.file_facts import NOT_STATED, RENDERS, description_of
 from nerfcli.render.files.float_maps import write_exr, write_png16
 from nerfcli.splats.files import write_splats
 from nerfcli.splats.gaussians import Gaussians
+from nerfcli.training.runs.settings import CPU_SAMPLES
 
 info = partial(nerfcli, "info")
 
@@ -226,6 +227,7 @@ def test_renders_show_the_definition_of_their_depth(tmp_path):
 def test_a_text_file_of_a_run_shows_the_run(finished, capture):
     whole = json.loads(info(finished, "--json").stdout)
     assert whole["kind"] == "run"
+    assert (whole["settings"]["first_samples_per_step"], whole["settings"]["samples_per_step"]) == CPU_SAMPLES
     for name in ("config.json", "cameras.json"):
         of_file = json.loads(info(finished / name, "--json").stdout)
         assert {**of_file, "path": whole["path"]} == whole

@@ -244,6 +244,9 @@ def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
     assert "<th class=number>another</th>" in text
     assert text.index("differs: settings.log2_rows") < text.index(">settings.seed<")
     assert "another: rendered" in text
+    on_gpu = facts("on a GPU", config=replace(facts().config, settings=TrainSettings(device="cuda")))
+    text = page_html([facts(), on_gpu], [look, look], depths=[_meta(), _meta()])
+    assert re.search(r"differs: settings.samples_per_step</t.>\s*<td[^>]*>65536</td>\s*<td[^>]*>262144<", text)
     farther = [replace(view, depth=view.depth + 1) for view in look]
     near, both = depth_range(look), depth_range([*look, *farther])
     assert f"&gt;= {both.high:.3g}" in page_html(

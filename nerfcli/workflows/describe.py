@@ -127,7 +127,7 @@ def describe_run(run: "Run") -> dict[str, Any]:
     from nerfcli.field.kinds import field_bytes
 
     config, cameras = run.config, run.cameras
-    settings = config.settings.to_json()
+    settings = config.settings.facts()
     content: dict[str, Any] = {
         "kind": "run",
         "scene": str(config.scene),

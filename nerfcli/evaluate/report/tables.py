@@ -161,9 +161,7 @@ def selection_table(runs: Sequence[RunFacts]) -> Table:
 
 def settings_table(runs: Sequence[RunFacts]) -> Table:
     """Format all settings and versions; rows in which runs differ are marked and come first."""
-    per_run = [
-        _flat({"settings": run.config.settings.to_json(), "versions": dict(run.config.versions)}) for run in runs
-    ]
+    per_run = [_flat({"settings": run.config.settings.facts(), "versions": dict(run.config.versions)}) for run in runs]
     keys = list(dict.fromkeys(key for settings in per_run for key in settings))
     rows = [(key, *(settings.get(key, "") for settings in per_run)) for key in keys]
     differing = [row for row in rows if len(set(row[1:])) > 1]

@@ -158,6 +158,11 @@ class TrainSettings:
     def to_json(self) -> dict[str, Any]:
         return {**asdict(self), "fixed": list(self.fixed)}
 
+    def facts(self) -> dict[str, Any]:
+        """Return the settings for the user: those of `to_json`, with the samples of a step that they stand for."""
+        first, most = self.samples
+        return {**self.to_json(), "first_samples_per_step": first, "samples_per_step": most}
+
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> "TrainSettings":
         """Read the content that `to_json` returned."""
