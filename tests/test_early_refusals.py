@@ -168,4 +168,5 @@ def test_resuming_what_has_used_its_budget_changes_nothing(capture, tmp_path):
     refused = nerfcli(*train, "--seed", "4", "--resume")
     assert refused.exit_code == BAD_INPUT
     assert error_of(refused)[0].endswith(f"{run} was trained with seed=3, not seed=4")
+    assert error_of(refused)[1].endswith("train into a new folder with -o, or replace it: --overwrite without --resume")
     assert listing(run) == before

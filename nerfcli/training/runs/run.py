@@ -189,7 +189,7 @@ def continued(run: Path, settings: TrainSettings, *, before: RunConfig) -> Train
     for name, value in (wanted | {name: getattr(settings.components, name) for name in named}).items():
         if had[name] != value:
             made, asked = (f"{name}={str(one).lower()}" for one in (had[name], value))
-            hint = "train into a new folder with -o, or again with --overwrite"
+            hint = "train into a new folder with -o, or replace it: --overwrite without --resume"
             raise UserError(f"{run} was trained with {made}, not {asked}", hint)
     given |= {name: getattr(settings, name) for name in ("budget_seconds", "steps", "device", "threads")}
     return replace(own, **given | {name: getattr(own, name) for name in ("components", "model", "fixed")})
