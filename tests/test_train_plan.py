@@ -1,6 +1,7 @@
 """The plan of a training against the files that a training leaves, and through the command."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typer.testing import CliRunner
 
 from nerfcli.captures.capture import Capture
 from nerfcli.cli import app
+from nerfcli.cli.options import FieldMemory
 from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import KINDS, chosen_size, parameter_bytes
@@ -47,6 +49,16 @@ def test_the_size_of_a_field_is_that_which_it_gets(kind: str) -> None:
     size = chosen_size(kind, hash_grid=HashFieldSettings("l2", log2_rows=rows), footprint=1e-4, memory_bytes=None)
     planned = planned_field(replace(STEPS, field=kind, log2_rows=rows))
     assert parameter_bytes(planned) == pytest.approx(parameter_bytes(size), rel=0.15)  # sizes are whole levels
+
+
+def test_help_states_the_sizes_of_a_hash_grid() -> None:
+    text = FieldMemory.__metadata__[0].help
+    stated = re.search(r"hash (\d+) to (\d+)MiB", text)
+    assert stated is not None, text
+    usual = TrainSettings(budget_seconds=1.0, threads=2)
+    sizes = (usual, replace(usual, budget_seconds=120.0), replace(usual, budget_seconds=3600.0))
+    found = [parameter_bytes(planned_field(size)) >> 20 for size in (*sizes, replace(usual, device="cuda"))]
+    assert (min(found), max(found)) == (int(stated[1]), int(stated[2]))
 
 
 def test_photos_that_memory_cannot_hold_are_on_the_disk() -> None:

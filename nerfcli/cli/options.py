@@ -80,7 +80,10 @@ FieldKind = Annotated[
 ]
 FieldMemory = Annotated[
     str | None,
-    typer.Option(help="Approximate size of the parameters: 4MB, 64MB.  [default: hash 8MiB, voxels 64MiB, mlp 256KiB]"),
+    typer.Option(
+        help="Approximate size of the parameters: 4MB, 64MB.  [default: hash 8 to 64MiB by the budget, voxels 64MiB, "
+        "mlp 256KiB]"
+    ),
 ]
 Contraction = Annotated[
     str,
