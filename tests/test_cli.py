@@ -563,7 +563,9 @@ def test_a_finished_training_is_kept_another_one_refused_and_overwritten_on_dema
     assert listing(run) == before
     other = nerfcli("train", capture, *QUICK, "--seed", "5")
     assert other.exit_code == BAD_INPUT
-    assert "exists" in error_of(other)[0]
+    error, hint = error_of(other)
+    assert "exists" in error
+    assert "add --resume to continue it with its own settings, --overwrite to replace it" in hint
     assert listing(run) == before
     replaced = nerfcli("train", capture, *QUICK, "--seed", "5", "--overwrite")
     assert replaced.exit_code == 0

@@ -216,7 +216,8 @@ def _keeps(task: _Task) -> bool:
             return True
         raise UserError(
             f"{path} exists, and is not a complete training with these settings",
-            "add --resume to continue, --overwrite to replace it, or choose another folder with -o",
+            "add --resume to continue it with its own settings, --overwrite to replace it, "
+            "or choose another folder with -o",
         )
     _refuse_others(path)
     return False
