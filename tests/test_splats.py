@@ -17,17 +17,20 @@ from nerfcli import Output, Reporter
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
+from nerfcli.captures.formats.run_cameras import write_cameras
 from nerfcli.errors import UserError, duration
 from nerfcli.field.exposure import exposed
 from nerfcli.kernels.numba_cpu.splats import render_splats
 from nerfcli.photos.images import read_image
 from nerfcli.photos.loading import LoadedPhoto
+from nerfcli.photos.masks import write_masks
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.job import RenderSettings
 from nerfcli.splats import refine as refinement
 from nerfcli.splats.gaussians import Gaussians, gaussians_of, rows_of
 from nerfcli.splats.refine import Refinement, load_splat_state, refine, splat_photos
 from nerfcli.splats.render import SplatScene
+from nerfcli.training.loop import OCCLUDERS
 from nerfcli.training.runs.files import SPLATS
 from nerfcli.workflows.evaluate import evaluate_splats
 from nerfcli.workflows.render import render_splats as render_file
@@ -243,6 +246,35 @@ def test_an_interrupt_saves_the_splats_and_writes_no_file(run: Path, monkeypatch
     assert not target.exists()
     assert load_splat_state(run / SPLATS).refinement.steps == 3
     assert notes[-1] == "the splats are saved; to continue, add --resume to the same command"
+
+
+def test_pixels_that_the_training_left_out_have_no_say(
+    spheres_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: what the training left out as occluders, or beyond the domain of the lens, came back as splats."""
+    run = shutil.copytree(spheres_run, tmp_path / "run")
+    cameras = nerfcli.load_run(run).cameras
+    first, second, *others = cameras.train
+    width, height = first.camera.size
+    mask = np.tile(np.arange(width) >= width // 2, (height, 1))
+    write_masks(run / OCCLUDERS, {first.name: mask})
+    # The distortion of this lens turns back within the picture.
+    lens = Camera("SIMPLE_RADIAL", width, height, (first.camera.focal_px, width / 2, height / 2, -3.0))
+    has_ray = lens.pixel_bearings()[1].reshape(height, width)
+    assert 0.1 < has_ray.mean() < 0.9
+    write_cameras(run, [first, replace(second, camera=lens), *others], cameras.test)
+    refined: list[refinement.SplatPhoto] = []
+
+    def enough(state: object, photos: list[refinement.SplatPhoto], **more: object) -> None:
+        refined.extend(photos)
+        raise UserError("enough", "of this test")
+
+    monkeypatch.setattr("nerfcli.workflows.splats.refine", enough)
+    with pytest.raises(UserError, match="enough"):
+        nerfcli.export_run(run, to="splats", splats=SMALL)
+    np.testing.assert_array_equal(refined[0].used, mask)
+    np.testing.assert_array_equal(refined[1].used, has_ray)
+    assert [photo.used for photo in refined[2:]] == [None] * len(others)
 
 
 def test_splats_of_a_run_in_a_read_only_folder_are_exported(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,8 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.notices import Notify, Reporter, silent
+from nerfcli.photos.images import read_image
 from nerfcli.photos.loading import LoadedPhoto, load_photos, pinhole_of
 from nerfcli.render.model import Model
 from nerfcli.splats.files import read_splats, write_splat_page, write_splats
@@ -32,6 +34,7 @@ from nerfcli.splats.refine import (
 )
 from nerfcli.splats.render import SplatScene, near_of
 from nerfcli.splats.start import count_for, gaussians_of_field
+from nerfcli.training.loop import OCCLUDERS
 from nerfcli.training.runs.files import SPLATS
 from nerfcli.training.runs.run import Run
 from nerfcli.version import __version__
@@ -152,8 +155,11 @@ def run_splats(run: Run, model: Model, *, settings: SplatSettings, reporter: Rep
         return kept
     if model.device.type != "cpu":
         reporter.note("splats are refined on the CPU; the GPU renders the field that they start from")
-    loaded = load_photos(
-        run.cameras.train, factor=run.config.downscale, threads=torch.get_num_threads(), masks=run.components.masks
+    loaded = _as_trained(
+        run,
+        load_photos(
+            run.cameras.train, factor=run.config.downscale, threads=torch.get_num_threads(), masks=run.components.masks
+        ),
     )
     pictures = pictures_beside(
         model, loaded, on_progress=reporter.part(0.0, _PICTURES, f"pictures of the field, {_before(settings)}")
@@ -217,6 +223,21 @@ def _kept(run: Run, model: Model, settings: SplatSettings) -> RunSplats | None:
         return None
     is_enough = splats.refinement.seconds >= settings.budget_seconds
     return splats if is_enough or settings.resume is not False else None
+
+
+def _as_trained(run: Run, loaded: Sequence[LoadedPhoto]) -> list[LoadedPhoto]:
+    """Return the photos without the pixels that the training left out: occluders, and those without a ray."""
+    has_ray = cache(lambda camera: camera.pixel_bearings()[1])
+    photos = []
+    for photo in loaded:
+        used = has_ray(photo.frame.camera).reshape(photo.pixels.shape[:2])
+        if photo.used is not None:
+            used = used & photo.used
+        occluders = run.path / OCCLUDERS / f"{photo.frame.name}.png"
+        if occluders.exists():
+            used = used & (read_image(occluders)[..., 0] > 0)
+        photos.append(replace(photo, used=None if used.all() else used))
+    return photos
 
 
 def _started(
