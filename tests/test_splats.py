@@ -277,6 +277,20 @@ def test_pixels_that_the_training_left_out_have_no_say(
     assert [photo.used for photo in refined[2:]] == [None] * len(others)
 
 
+def test_splats_of_panoramas_are_refused_before_any_work(
+    spheres_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: the field was rendered first, and the hint was for `nerfcli render`."""
+    run = shutil.copytree(spheres_run, tmp_path / "run")
+    first, *others = nerfcli.load_run(run).cameras.train
+    sphere = Camera("EQUIRECTANGULAR", 96, 48, (96.0, 48.0))
+    write_cameras(run, [replace(first, camera=sphere), *others], [])
+    monkeypatch.setattr("nerfcli.workflows.splats.load_photos", lambda *given, **more: pytest.fail("work was done"))
+    with pytest.raises(UserError, match="360-degree photos, which splats cannot be fitted to") as refused:
+        nerfcli.export_run(run, to="splats", splats=SMALL)
+    assert refused.value.hint == "export it as a page, a mesh or points: --to page, mesh or points"
+
+
 def test_splats_of_a_run_in_a_read_only_folder_are_exported(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Regression: they were refined, and then lost, because they could not be kept in the run."""
 

@@ -78,7 +78,7 @@ def export_splats(
     """Write the splats of a run as .ply, .spz or .html; make and refine them first if the run does not have them.
 
     Raises:
-        UserError: a photo cannot be read, numbers are not finite, or the file cannot be written.
+        UserError: a photo cannot be read or is a 360-degree photo, numbers are not finite, or the file is not written.
         KeyboardInterrupt: passed on after the state of the refinement has been saved.
     """
     if path.suffix.lower() == ".html" and settings.frame == "scene":
@@ -86,6 +86,11 @@ def export_splats(
             "--frame scene is for .ply and .spz: the page needs y to point down",
             "remove it, or write a .ply",
             exit_code=2,
+        )
+    if any(frame.camera.is_spherical for frame in run.cameras.train):
+        raise UserError(
+            f"{run.path} was trained on 360-degree photos, which splats cannot be fitted to",
+            "export it as a page, a mesh or points: --to page, mesh or points",
         )
     splats = run_splats(run, model, settings=settings, reporter=reporter)
     file_from_scene = Similarity.identity() if settings.frame == "scene" else viewer_from_scene(run)
