@@ -199,6 +199,15 @@ def test_a_disk_that_cannot_be_replaced_is_refused_before_rendering(model, tmp_p
     assert set(tmp_path.iterdir()) == {disk, link}
 
 
+@pytest.mark.parametrize(("folder", "inside"), [(".", "renders"), ("/", "/renders")])
+def test_a_folder_without_a_name_is_refused(model, tmp_path, monkeypatch, folder, inside):
+    """Regression: `-o .` was a traceback."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=f"{Path(folder).resolve()} cannot be the output itself") as refused:
+        render(model, job_of(), Path(folder))
+    assert refused.value.hint == f"choose a folder in it: -o {inside}"
+
+
 def test_videos_of_a_mounted_folder_are_written_into_it(model, tmp_path, monkeypatch):
     render(model, job_of(video=None), tmp_path / "views")
     monkeypatch.setattr("os.path.ismount", lambda path: path == tmp_path / "views")

@@ -84,6 +84,11 @@ def render_job(
         raise UserError(
             f"--frames selects none of the {len(frames)} views", f"give a part of 0:{len(frames)}, or K/N", exit_code=2
         )
+    if not folder.name:  # "." or the root; a shell in a folder that is replaced goes on to show the old one
+        raise UserError(
+            f"{folder.resolve()} cannot be the output itself, as a finished folder takes its place",
+            f"choose a folder in it: -o {in_shell(folder / 'renders')}",
+        )
     place = folder.resolve() if folder.is_symlink() else folder  # a link may lead to another disk
     unfinished = _Unfinished(place.with_name(f".{folder.name}.unfinished-{job.digest}"))
     if job.is_kept_in(folder, output):
