@@ -40,7 +40,7 @@ from nerfcli.render.trained_field import Marching
 from nerfcli.training.runs.run import Run
 from nerfcli.viewer.packing import FINEST_LEVEL, pack_model, quantised, reached_rows, seen_cells
 from nerfcli.viewer.page import numbers_of, page_html, scene_of
-from nerfcli.viewer.pictures import HEIGHT, WIDTH, PagePhotos, Proof, make_proof
+from nerfcli.viewer.pictures import HEIGHT, WIDTH, PagePhotos, Proof, make_proof, page_photos
 from nerfcli.workflows import photo_depths
 from nerfcli.workflows.export import export_run
 
@@ -233,6 +233,15 @@ def test_the_page_loads_nothing(spheres_page):
     assert "default-src 'none'" in text
     assert not re.search(r"""(src|href)\s*=\s*["']?https?:""", text)
     assert len(text) < 10_000_000
+
+
+def test_photos_are_shown_though_their_masks_are_gone(spheres_run, tmp_path):
+    """Regression: masks, which are not shown, were read, and the page failed without them."""
+    cameras = Run(spheres_run).cameras
+    masked = replace(cameras.train[0], mask=tmp_path / "gone.png")
+    photos = [page_photos(cameras.exposures, [frame], [], room_bytes=10**6) for frame in (masked, cameras.train[0])]
+    assert photos[0] == photos[1]
+    assert photos[0].entries[0]["picture"].startswith("data:image/jpeg")
 
 
 # In a browser

@@ -149,7 +149,7 @@ def _longest(frames: Sequence[tuple[Frame, str]], shown: Sequence[int], room_byt
 def _small_photo(frame: Frame, longest_px: int) -> np.ndarray:
     """Return an undistorted photo, its longer side at most about `longest_px`; on white where it is transparent."""
     factor = max(1.0, max(frame.camera.width, frame.camera.height) / longest_px)
-    photo = load_photo(frame, factor, "ignore")
+    photo = load_photo(replace(frame, mask=None), factor, "ignore")  # masks are not shown
     small = photo.frame.camera
     pixels, _ = undistorted(photo.pixels, small, pinhole_of(small))
     if pixels.shape[-1] == 4:
