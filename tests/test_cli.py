@@ -912,6 +912,9 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
     assert f"report with all results: {run / 'report.html'}" in first.stderr
     assert first.stdout.splitlines() == [str(path) for path in expected]
     assert all(path.exists() for path in expected)
+    (film,) = re.findall(r"`nerfcli render \S+ --splats \S+\.ply ([^`]*)`", GUIDES[0].read_text(encoding="utf-8"))
+    film = film.replace("photos/", f"{tmp_path}/").split()
+    assert nerfcli("render", run, "--splats", tmp_path / "all" / "run-splats.ply", *film).exit_code == 0
     before = listing(run)
     again = nerfcli(*arguments)
     assert (again.exit_code, again.stdout) == (0, first.stdout)
