@@ -210,6 +210,21 @@ def test_the_mask_of_a_photo_that_is_missing_is_not_taken_for_it(tmp_path):
 
 
 @pytest.mark.parametrize("write", [colmap, transforms])
+@pytest.mark.parametrize("listed", ["../images/{{}}.png", "{folder}/images/{{}}.png", "images/{{}}.png"])
+def test_photos_are_only_taken_from_the_folder_that_the_user_gives(write, listed, tmp_path):
+    """Not from where the names lead, not even those that the folder lacks."""
+    photos(tmp_path, numbered("images/{}.png"))
+    photos(tmp_path, numbered("capture/images/{}.png"))
+    photos(tmp_path, numbered("edited/{}.png"))
+    (tmp_path / "edited/0.png").unlink()
+    write(tmp_path / "capture", numbered(listed.format(folder=tmp_path)))
+    images = [frame.image for frame in parsed(tmp_path / "capture", images=tmp_path / "edited").frames]
+    assert [path for path in images if path and path.is_file()] == [
+        tmp_path / "edited" / f"{i}.png" for i in range(1, COUNT)
+    ]
+
+
+@pytest.mark.parametrize("write", [colmap, transforms])
 def test_a_conversion_names_missing_photos_and_fails_without_any(write, tmp_path):
     photos(tmp_path / "images", numbered("{}.png")[2:])
     write(tmp_path, numbered("images/{}.png"))

@@ -9,7 +9,7 @@ import filecmp
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from nerfcli.cameras.frame import Size
 from nerfcli.captures.capture import Capture
@@ -43,7 +43,8 @@ class FoundPhotos:
     @property
     def places(self) -> tuple[Path | None, ...]:
         """The photos; of those that are missing, where they should be, or None without a folder of photos."""
-        expected = (None if self.folder is None else self.folder / name for name in self.names)
+        inside = ([part for part in PurePosixPath(name).parts if part != ".."] for name in self.names)
+        expected = (None if self.folder is None else self.folder.joinpath(*parts) for parts in inside)
         return tuple(path or place for path, place in zip(self.paths, expected, strict=True))
 
     @property

@@ -5,7 +5,7 @@ import os
 import re
 import unicodedata
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
@@ -73,16 +73,24 @@ class Place:
         home: the folder from which paths are shown.
         is_usual: whether the format, or the user, says that photos are there.
         subfolders: those in which files are looked for, too; None for all.
+        is_given: whether the user says that all photos are there, so that no name leads elsewhere.
     """
 
     path: Path
     home: Path
     is_usual: bool
     subfolders: frozenset[str] | None = None
+    is_given: bool = False
 
     @property
     def is_reduced(self) -> bool:
         return self.path != self.home and _REDUCED.search(self.path.name) is not None
+
+    def exact(self, name: Name) -> Path | None:
+        """Return the photo with exactly this name; None if there is none."""
+        path = self.path / name.plain  # outside, if the name is absolute or has ".."
+        is_allowed = not self.is_given or Path(os.path.abspath(path)).is_relative_to(os.path.abspath(self.path))
+        return path if is_allowed and os.path.isfile(path) else None
 
     def photos(self) -> Photos:
         """Return the parts of the photos' paths by their stems and the names of their folders."""
@@ -141,7 +149,7 @@ def places_of(
         usual.append(Place(home, home, True, in_names))
         unusual = [name for name in others if name not in folders]
         further += [Place(home / name, home, False) for name in _in_order(inside, unusual) if (home / name).is_dir()]
-    return [*usual, *further]
+    return [replace(place, is_given=is_given) for place in (*usual, *further)]
 
 
 def _in_order(there: Sequence[str], names: Sequence[str]) -> list[str]:
@@ -160,7 +168,7 @@ def _in_order(there: Sequence[str], names: Sequence[str]) -> list[str]:
 
 def search_of(place: Place, names: Sequence[Name], sizes: Sequence[Size | None] | None) -> Search:
     """Look names up in a folder."""
-    paths: list[Path | None] = [path if os.path.isfile(path := place.path / name.plain) else None for name in names]
+    paths = [place.exact(name) for name in names]
     exact, problems, unfit = len(names) - paths.count(None), [], []
     if exact < len(names):
         photos, taken = place.photos(), {path for path in paths if path is not None}

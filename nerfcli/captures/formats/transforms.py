@@ -156,7 +156,8 @@ def listed_frames(
         name if PurePosixPath(name).suffix else name + (suffix if image is None else image.suffix)
         for name, image in zip(found.names, found.paths, strict=True)
     ]
-    places = [image or home / name for name, image in zip(names, found.paths, strict=True)]
+    expected = [home / name if images is None else images / PurePosixPath(name).name for name in names]
+    places = [image or place for place, image in zip(expected, found.paths, strict=True)]
     known = _known_sizes(sizes, places, listed[0][1], default=size)
     masks, lost_masks = _beside(path, listed, "mask_path", "mask", places=(home, folders[1]), photos=set(places))
     depths, lost_depths = _beside(
