@@ -1,5 +1,7 @@
 """Another world frame: what a similarity changes in a capture and what it keeps; up, origin, smallest rotation."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,7 @@ from examples import examples
 from frame_rays import frame_rays
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
@@ -15,7 +18,16 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.captures.capture import Capture, Observations
-from nerfcli.captures.world import WORLD_AXES, moved_to_origin, smallest_rotation, transformed, up_aligned
+from nerfcli.captures.orientation import STORED, UPRIGHT, in_pixels
+from nerfcli.captures.world import (
+    WORLD_AXES,
+    WorldFrame,
+    in_world_frame,
+    moved_to_origin,
+    smallest_rotation,
+    transformed,
+    up_aligned,
+)
 from nerfcli.errors import UserError
 
 few = examples(30)
@@ -75,6 +87,22 @@ def test_up_points_along_the_axis_and_nothing_else_changes_size(seed, axis):
     assert turn.scale == 1
     np.testing.assert_array_equal(turn.translation, 0)
     np.testing.assert_allclose(up_direction(transformed(capture, turn).frames), WORLD_AXES[axis], rtol=0, atol=1e-9)
+
+
+def test_up_is_that_of_upright_photos_where_the_cameras_are_for_stored_pixels(tmp_path):
+    """Regression: a capture of portrait photos was tipped by 90 degrees."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("L", (64, 48)).save(tmp_path / "portrait.jpg", exif=exif)
+    frames = [
+        replace(frame, camera=Camera.pinhole(48, 64, 50.0), image=tmp_path / "portrait.jpg")
+        for frame in capture_of(np.random.default_rng(0)).frames
+    ]
+    stored = in_pixels(Capture(tuple(frames), pixels=UPRIGHT), STORED).capture
+    assert stored.frames[0].camera.size == (64, 48)
+    moved = in_world_frame(stored, WorldFrame(up="z")).capture
+    upright = in_pixels(moved, UPRIGHT).capture.frames
+    np.testing.assert_allclose(up_direction(upright), WORLD_AXES["z"], rtol=0, atol=1e-9)
 
 
 def test_axes_by_hand():

@@ -14,7 +14,7 @@ from nerfcli.cameras.rigid import Similarity
 from nerfcli.captures.axes import poses_of
 from nerfcli.captures.boards import CharucoBoard, scale_from_charuco, scale_from_markers
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.orientation import measure_of, upright
+from nerfcli.captures.orientation import UPRIGHT, in_pixels, measure_of, upright
 from nerfcli.captures.scale import (
     ScaleEstimate,
     gps_positions,
@@ -132,14 +132,19 @@ class Moved:
 
 
 def in_world_frame(capture: Capture, wanted: WorldFrame) -> Moved:
-    """Move a capture to another world frame: first the origin, then the up axis, then the scale about that origin."""
+    """Move a capture to another world frame: first the origin, then the up axis, then the scale about that origin.
+
+    Raises:
+        UserError: a property is invalid or cannot be estimated; or for the up axis, see `in_pixels`.
+    """
     _check_combination(wanted)
     estimate = _estimate(capture, wanted)
     change = Similarity.identity()
     if wanted.origin is not None:
         change = moved_to_origin(capture.frames, wanted.origin)
     if wanted.up is not None:
-        change = up_aligned(capture.frames, wanted.up).compose(change)
+        # Stored pixels of portrait photos lie on their side.
+        change = up_aligned(in_pixels(capture, UPRIGHT).capture.frames, wanted.up).compose(change)
     factor = _factor(wanted.scale) if estimate is None else estimate.metres_per_unit
     if factor != 1:
         change = Similarity(factor, np.eye(3), np.zeros(3)).compose(change)
