@@ -78,17 +78,19 @@ def test_a_capture_without_photos_says_how_to_give_them(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", WITH_PHOTOS)
-def test_photos_in_another_folder_are_given(name, tmp_path):
+def test_photos_in_another_folder_are_given(name, tmp_path, monkeypatch):
     file = WITH_PHOTOS[name](VIEWS, tmp_path / "capture")
     (tmp_path / "elsewhere").mkdir()
     for photo in [path for path in (tmp_path / "capture").rglob("*") if path.suffix in (".jpg", ".png")]:
         if photo.parent.name != "mask":
             photo.rename(tmp_path / "elsewhere" / photo.name)
     form, found = recognise(file if name == "run" else tmp_path / "capture")
-    frames = form.parse(found, UserInputs(images=tmp_path / "elsewhere")).frames
-    assert len(frames) == len(POSES)
-    assert all(frame.has_photo for frame in frames)
-    assert {frame.image.parent for frame in frames if frame.image} == {tmp_path / "elsewhere"}
+    monkeypatch.chdir(tmp_path)
+    for images in (tmp_path / "elsewhere", Path("elsewhere")):
+        frames = form.parse(found, UserInputs(images=images)).frames
+        assert len(frames) == len(POSES)
+        assert all(frame.has_photo for frame in frames)
+        assert {frame.image.absolute().parent for frame in frames if frame.image} == {tmp_path / "elsewhere"}
 
 
 @pytest.mark.parametrize("name", WITHOUT_PHOTOS)

@@ -39,7 +39,7 @@ _ROUNDING_PX = 0.01
 def parse_neus(path: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the cameras of the file, in its world; the photos are those beside it, in order."""
     members = members_of_npz(path)
-    photos = _pictures(path.parent, (given.images,) if given.images else IMAGE_FOLDERS)
+    photos = _pictures(path.parent, (given.images.absolute(),) if given.images else IMAGE_FOLDERS)
     masks = _pictures(path.parent, MASK_FOLDERS)
     count = 0
     while f"world_mat_{count}" in members:
