@@ -93,7 +93,7 @@ def write_by(name: str, place: str, views: Views, folder: Path) -> Path:
 def write_run(views: Views, folder: Path) -> Path:
     frames = views.frames(folder)
     write_cameras(folder, frames[1:], frames[:1])
-    text(folder / "config.json", "{}")
+    text(folder / "config.json", '{"unit": "metre", "unit_source": "LiDAR"}')
     return folder / "cameras.json"
 
 

@@ -24,7 +24,7 @@ LENSES = {
     **dict.fromkeys(("blender", "llff", "bundler"), CAMERA),
     **dict.fromkeys(("metashape", "reality-capture", "openmvg"), ONE_FOCAL_LENGTH),
 }
-METRIC = ("polycam", "record3d", "stray-scanner", "3d-scanner-app", "euroc", "tum-rgbd", "scannetpp")
+METRIC = ("polycam", "record3d", "stray-scanner", "3d-scanner-app", "euroc", "tum-rgbd", "scannetpp", "run")
 ROTATIONS = Rotation.from_rotvec([[0.1, -0.4, 0.2], [1.3, 0.2, -0.7], [-0.5, 2.1, 0.3]])
 POSES = rigid.from_parts(ROTATIONS.as_matrix(), np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 2.0], [0.1, -3.0, 1.5]]))
 VIEWS = Views(CAMERA, POSES)

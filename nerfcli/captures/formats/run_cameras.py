@@ -12,12 +12,14 @@ from nerfcli.atomic import SEAL, read_sealed, write_sealed
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
+from nerfcli.captures.formats.fields import read_json_object
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.photo_names import seen_from, with_photos
 from nerfcli.errors import UserError
 from nerfcli.photos.held_out_exposure import PhotoExposures
 
 CAMERAS = "cameras.json"
+_CONFIG = "config.json"
 # Hint for a damaged file of a run.
 REPAIR_HINT = f"train again with --overwrite, or restore the file; if you edited it yourself, remove its entry {SEAL}"
 # Keys: in an entry, camera and pose as the scene had them; beside the entries, exposures, and the run's absolute path.
@@ -76,21 +78,23 @@ def read_given_cameras(run: Path) -> RunCameras:
 def find_run(path: Path) -> Path | None:
     """Return RUN/cameras.json, given the folder of a run or that file itself; None if the path is neither."""
     file = path if path.is_file() and path.name == CAMERAS else path / CAMERAS
-    return file if file.is_file() and (file.parent / "config.json").is_file() else None
+    return file if file.is_file() and (file.parent / _CONFIG).is_file() else None
 
 
 def parse_run(path: Path, given: UserInputs = UserInputs()) -> Capture:
-    """Return the frames of a RUN/cameras.json, training photos first; a run has no points.
+    """Return the frames of a RUN/cameras.json, training photos first, in the unit of the scene; a run has no points.
 
     Photos are where the run found them, unless the user gives their folder.
 
     Raises:
-        UserError: see `read_cameras`.
+        UserError: see `read_cameras`, or config.json beside the file cannot be read.
     """
     cameras = _read_frames(path, given=False)
     splits = (("train", cameras.train), ("test", cameras.test))
     frames = tuple(replace(frame, split=split) for split, frames in splits for frame in frames)
-    capture = Capture(frames, kind="run", pixels="upright")
+    config = read_json_object(path.with_name(_CONFIG))
+    unit, source = config.get("unit") or "arbitrary", config.get("unit_source")
+    capture = Capture(frames, kind="run", unit=unit, unit_source=source, pixels="upright")
     return capture if given.images is None else with_photos(capture, given=given.images)
 
 
