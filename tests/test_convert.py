@@ -1,6 +1,7 @@
 """Conversions: round trips through every writable format, losses, faults that reading back must see, exit codes."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -427,7 +428,9 @@ def test_help_names_all_formats():
         text.split("Formats written:")[1].split("Inside")[0],
         text.split("Formats read:")[1].split("Formats w")[0],
     )
+    intrinsics = text.rsplit("--intrinsics", 1)[1].split("--world-up")[0].replace("│", "")
     for form in FORMATS:
         assert (form.write is None) == (form.name not in FORMATS_WRITTEN)
         assert form.write is None or form.name in written
         assert not form.looked_for or form.name.removesuffix("-text") in read
+        assert not form.takes_camera or form.name in re.split(r"[\s,:]+", intrinsics)

@@ -80,7 +80,8 @@ class SourceOptions:
     intrinsics: Annotated[
         Path | None,
         typer.Option(
-            help="File with the camera for tum, kitti and pose-files: cameras.txt, a JSON camera, or a capture."
+            help="File with the camera for tum, kitti, pose-files, tum-rgbd and kapture: cameras.txt, a JSON camera, "
+            "or a capture."
         ),
     ] = None
 
