@@ -4,6 +4,7 @@ import shutil
 import stat
 import zipfile
 from collections import namedtuple
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -217,14 +218,18 @@ def test_commands_without_a_result_say_how_to_unpack(tmp_path):
         assert "nerfcli convert" in caught.value.hint
 
 
+def write_scan_with_video(folder: Path, levels: Sequence[int]) -> None:
+    """Write a capture of Stray Scanner without photos, and its video, with frames of these grey levels."""
+    WITH_PHOTOS["stray-scanner"](Views(VIEWS.camera, np.tile(POSES, (3, 1, 1))), folder)
+    for photo in (folder / "rgb").iterdir():
+        photo.unlink()
+    encode(folder / "rgb.mp4", [np.full((48, 64, 3), level, np.uint8) for level in levels])
+
+
 def test_frames_of_a_video_are_written_beside_the_result(tmp_path):
     """Each photo is the video's frame of its number: its brightness says which."""
-    poses = np.tile(POSES, (3, 1, 1))
-    WITH_PHOTOS["stray-scanner"](Views(VIEWS.camera, poses), tmp_path / "scan")
-    for photo in (tmp_path / "scan/rgb").iterdir():
-        photo.unlink()
     levels = [20, 60, 100, 140, 180, 220]
-    encode(tmp_path / "scan/rgb.mp4", [np.full((48, 64, 3), level, np.uint8) for level in levels])
+    write_scan_with_video(tmp_path / "scan", levels)
     with pytest.raises(UserError, match=r"none of its 6 photos is on disk") as caught:
         load_scene(tmp_path / "scan")
     assert "they are frames of rgb.mp4; nerfcli convert" in caught.value.hint
@@ -246,3 +251,22 @@ def test_frames_of_a_video_are_written_beside_the_result(tmp_path):
         "rgb",
         "rgb.mp4",
     ]
+
+
+@pytest.mark.parametrize(
+    ("target", "form", "more", "message"),
+    [
+        ("room", "nerfcli", {"masks": Path("nowhere")}, "the mask folder nowhere does not exist"),
+        ("room.json", "transforms", {}, r"it would lose: the unit of length \(metre\)"),
+        ("scan", "colmap", {}, "scan/cameras.bin exists"),
+        ("room", "stray-scanner", {}, "stray-scanner can be read, not written"),
+    ],
+)
+def test_no_video_is_decoded_for_a_conversion_that_is_refused(target, form, more, message, tmp_path, monkeypatch):
+    """Regression: with --overwrite, it had replaced the frames of the earlier result by then."""
+    write_scan_with_video(tmp_path / "scan", [20, 60])
+    (tmp_path / "scan/cameras.bin").touch()
+    monkeypatch.setattr("nerfcli.workflows.convert.extract_frames", lambda *_, **__: pytest.fail("decoded"))
+    wanted = TargetOptions(format_named(form), overwrite=target == "room")
+    with pytest.raises(UserError, match=message):
+        convert_capture(tmp_path / "scan", tmp_path / target, wanted, given=UserInputs(**more))

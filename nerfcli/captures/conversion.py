@@ -183,35 +183,55 @@ def convert(capture: Capture, target: Path, wanted: TargetOptions) -> Conversion
             written file does not agree with the capture.
     """
     form = wanted.form
-    if form.write is None or form.losses is None:
-        raise UserError(f"{form.name} can be read, not written", "choose another format with --to", exit_code=2)
+    path = target_path(target, wanted)
     convention = _convention(form, wanted)
-    path = (
-        target
-        if not form.default_name or target.suffix == Path(form.default_name).suffix
-        else target / form.default_name
-    )
     turned = in_pixels(capture, _pixels(form, wanted))
     capture = turned.capture
     off = len(turned.masks_left_out)
     turned_masks = (f"{several(off, 'mask')} not turned like the photo (EXIF orientation)",) if off else ()
-    losses = (*turned_masks, *form.losses(capture))
+    losses = accepted_losses(capture, wanted, turned_masks)
+    assert form.write is not None
+    with _kept_on_success(path, _files(form, path)):
+        form.write(expressed(capture, convention, written_axes=form.axes), path)
+        checked, loss_px = _checked(capture, path, form, convention)
+    return Conversion(path, capture, losses, loss_px, checked, _orientation_notes(turned))
+
+
+def target_path(target: Path, wanted: TargetOptions) -> Path:
+    """Return the file or folder that is written: the target, or the format's usual file in it.
+
+    Raises:
+        UserError: the format is only read, or the result exists and may not be replaced.
+    """
+    form = wanted.form
+    if form.write is None:
+        raise UserError(f"{form.name} can be read, not written", "choose another format with --to", exit_code=2)
+    is_target = not form.default_name or target.suffix == Path(form.default_name).suffix
+    path = target if is_target else target / form.default_name
+    there = [file for file in _files(form, path) if file.exists()]
+    if there and not wanted.overwrite:
+        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another output path")
+    return path
+
+
+def accepted_losses(capture: Capture, wanted: TargetOptions, others: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """Return the contents of a capture that the format cannot hold, after other losses.
+
+    Raises:
+        UserError: they are not allowed.
+    """
+    form = wanted.form
+    assert form.losses is not None
+    losses = (*others, *form.losses(capture))
     # 2D features are data of structure from motion, which nobody expects in other formats: losing them is no reason to
     # refuse.
-    refused = (*turned_masks, *form.losses(replace(capture, observations=None)))
+    refused = (*others, *form.losses(replace(capture, observations=None)))
     if refused and not wanted.allow_loss:
         raise UserError(
             f"{form.name} cannot hold everything in this capture; it would lose: {'; '.join(losses)}",
             "add --allow-loss to drop that, or use another format, such as nerfcli, which holds the most",
         )
-    files = _files(form, path)
-    there = [file for file in files if file.exists()]
-    if there and not wanted.overwrite:
-        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another output path")
-    with _kept_on_success(path, there, files):
-        form.write(expressed(capture, convention, written_axes=form.axes), path)
-        checked, loss_px = _checked(capture, path, form, convention)
-    return Conversion(path, capture, losses, loss_px, checked, _orientation_notes(turned))
+    return losses
 
 
 def _pixels(form: Format, wanted: TargetOptions) -> str:
@@ -282,9 +302,10 @@ def _files(form: Format, path: Path) -> list[Path]:
 
 
 @contextmanager
-def _kept_on_success(path: Path, there: list[Path], files: list[Path]) -> Iterator[None]:
+def _kept_on_success(path: Path, files: list[Path]) -> Iterator[None]:
     """Set existing files aside; on any exception remove written files and new folders, and put the old files back."""
     path = path.absolute()  # "." has no name
+    there = [file for file in files if file.exists()]
     folders = {folder for file in files for folder in file.parents} | {path, *path.parents}
     missing = sorted((folder for folder in folders if not folder.exists()), key=lambda folder: -len(folder.parts))
     place = path.with_name(f".{path.name}.aside-{os.getpid()}")  # not the name that atomic_folder uses

@@ -13,11 +13,14 @@ from nerfcli.captures.conversion import (
     ConventionOverrides,
     Conversion,
     TargetOptions,
+    accepted_losses,
     convert,
     load,
     recognise_given,
+    target_path,
 )
 from nerfcli.captures.formats.format import Format, UserInputs
+from nerfcli.captures.formats.registry import refuse_missing_masks
 from nerfcli.captures.orientation import STORED, describe_rescaling, in_pixels, other_sizes
 from nerfcli.captures.world import WorldFrame, in_world_frame
 from nerfcli.errors import UserError, listed, several
@@ -48,9 +51,11 @@ def convert_capture(
         UserError: the capture cannot be read or written, the format cannot hold it, or what was written differs.
     """
     to = wanted.form.name
-    output = Output(target, wanted.overwrite)
-    source = unpacked(source, output, reporter=reporter)
-    given = _with_frames(source, output, given, reporter)
+    target_path(target, wanted)  # refused before files are unpacked and frames replaced
+    if given.masks is not None:
+        refuse_missing_masks(given.masks)
+    source = unpacked(source, Output(target, wanted.overwrite), reporter=reporter)
+    given = _with_frames(source, target, wanted, given=given, world=world, reporter=reporter)
     form, found, capture = load(source, given, overrides)
     reporter.note(f"{found}: {form.name}, {contents(capture)}")
     for text in capture.notes:
@@ -85,17 +90,24 @@ def convert_capture(
     return done, {"from": form.name, "to": to} | _record(done) | frame
 
 
-def _with_frames(source: Path, output: Output, given: UserInputs, reporter: Reporter) -> UserInputs:
-    """Return the user's inputs, with the frames of a capture's video, written beside the output if it has no photos."""
+def _with_frames(
+    source: Path, target: Path, wanted: TargetOptions, *, given: UserInputs, world: WorldFrame, reporter: Reporter
+) -> UserInputs:
+    """Return the user's inputs, with the frames of a capture's video, written beside the target if it has no photos."""
     form, found = recognise_given(source, given)
     video = None if given.images is not None else form.video(found)
-    if video is None or any(frame.has_photo for frame in form.parse(found, given).frames):
+    if video is None:
         return given
-    target = output.at(source)
+    capture = form.parse(found, given)
+    if any(frame.has_photo for frame in capture.frames):
+        return given
+    # A scene holds everything, but needs the photos; with another scale, the unit is not lost.
+    if wanted.form.name != "nerfcli" and world.scale is None:
+        accepted_losses(capture, wanted)
     folder = frames_folder(target.with_suffix("") if target.suffix else target)
     with reporter.stage(f"extract frames of {video.name}") as stage:
         extract_frames(
-            video, folder, count=None, overwrite=output.overwrite, notify=stage.note, progress=stage.progress
+            video, folder, count=None, overwrite=wanted.overwrite, notify=stage.note, progress=stage.progress
         )
     return replace(given, images=folder)
 

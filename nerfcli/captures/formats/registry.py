@@ -168,6 +168,12 @@ def depths_beside(photos: Path) -> dict[str, SensorDepth]:
     return {image.relative_to(home).as_posix(): depth for image, depth in inside if image.is_relative_to(home)}
 
 
+def refuse_missing_masks(folder: Path) -> None:
+    """Refuse a folder of masks that is not there."""
+    if not folder.is_dir():
+        raise UserError(f"the mask folder {folder} does not exist", "give a folder with a mask for each photo")
+
+
 def with_masks(capture: Capture, folder: Path) -> Capture:
     """Return the capture with masks from a folder, by the names of the photos, the ends of these, or those on disk.
 
@@ -176,8 +182,7 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
     Raises:
         UserError: there is no such folder, it has no mask for any photo, or it contains the photos.
     """
-    if not folder.is_dir():
-        raise UserError(f"the mask folder {folder} does not exist", "give a folder with a mask for each photo")
+    refuse_missing_masks(folder)
     found = [
         mask_of(f.name, folder) or (mask_of(_end_on_disk(f.name, f.image), folder) if f.image else None)
         for f in capture.frames
