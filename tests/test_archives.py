@@ -270,3 +270,14 @@ def test_no_video_is_decoded_for_a_conversion_that_is_refused(target, form, more
     wanted = TargetOptions(format_named(form), overwrite=target == "room")
     with pytest.raises(UserError, match=message):
         convert_capture(tmp_path / "scan", tmp_path / target, wanted, given=UserInputs(**more))
+
+
+def test_results_whose_names_have_a_dot_have_frames_of_their_own(tmp_path):
+    """Regression: the frames of room.2 replaced those of room.1."""
+    write_scan_with_video(tmp_path / "scan", [20, 60, 100, 140, 180, 220])
+    for name in ("room.1", "room.2"):
+        convert_capture(tmp_path / "scan", tmp_path / name, TargetOptions(format_named("nerfcli")))
+    unitless, silent = TargetOptions(format_named("transforms"), allow_loss=True), Reporter(warn=lambda text: None)
+    convert_capture(tmp_path / "scan", tmp_path / "room.3.json", unitless, reporter=silent)
+    folders = sorted(path.name for path in tmp_path.iterdir() if path.is_dir())
+    assert folders == ["room.1", "room.1-frames", "room.2", "room.2-frames", "room.3-frames", "scan"]

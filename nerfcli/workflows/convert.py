@@ -104,7 +104,8 @@ def _with_frames(
     # A scene holds everything, but needs the photos; with another scale, the unit is not lost.
     if wanted.form.name != "nerfcli" and world.scale is None:
         accepted_losses(capture, wanted)
-    folder = frames_folder(target.with_suffix("") if target.suffix else target)
+    is_file = wanted.form.default_name and target.suffix == Path(wanted.form.default_name).suffix
+    folder = frames_folder(target.with_suffix("") if is_file else target)
     with reporter.stage(f"extract frames of {video.name}") as stage:
         extract_frames(
             video, folder, count=None, overwrite=wanted.overwrite, notify=stage.note, progress=stage.progress
