@@ -16,7 +16,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.axes import Convention, all_axes, expressed, opencv_from_axes, pose_in_axes, reinterpreted
 from nerfcli.captures.capture import Capture, Observations
-from nerfcli.captures.conversion import ConventionOverrides, TargetOptions, convert, load
+from nerfcli.captures.conversion import TargetOptions, convert, load
 from nerfcli.captures.formats import blender, llff, transforms, transforms_cameras
 from nerfcli.captures.formats.colmap import write_colmap_binary
 from nerfcli.captures.formats.format import UserInputs
@@ -118,14 +118,14 @@ def test_colmap_to_a_format_and_back_moves_no_pixel(form, tmp_path):
         capture = replace(capture, frames=tuple(replace(frame, camera=PINHOLE) for frame in capture.frames))
     back = nerfcli("convert", report["path"], tmp_path / "back", "--to", "colmap", "--allow-loss", *more)
     assert back.exit_code == 0, back.stderr
-    _, _, again = load(tmp_path / "back", UserInputs(), ConventionOverrides())
+    _, _, again = load(tmp_path / "back", UserInputs(), Convention())
     assert reprojection_px(capture, again) < LIMIT_PX
 
 
 def test_axes_and_pixel_centre_of_the_written_file(tmp_path):
     """By hand: with OpenCV axes the matrix is world_from_cam itself, and with centres at 0 cx is half a pixel less."""
     source, out = model_of(tmp_path, capture_of([PINHOLE])), tmp_path / "out.json"
-    capture = load(source, UserInputs(), ConventionOverrides())[2]
+    capture = load(source, UserInputs(), Convention())[2]
     options = ("--axes", "opencv", "--pixel-center", "0", "--allow-loss")
     result = nerfcli("convert", source, out, "--to", "transforms", *options)
     assert result.exit_code == 0, result.stderr
@@ -135,7 +135,7 @@ def test_axes_and_pixel_centre_of_the_written_file(tmp_path):
     assert content["cx"] == PINHOLE.params[2] - 0.5
     options = ("--from-axes", "opencv", "--from-pixel-center", "0")
     assert nerfcli("convert", out, tmp_path / "back", "--to", "colmap", *options).exit_code == 0
-    assert reprojection_px(capture, load(tmp_path / "back", UserInputs(), ConventionOverrides())[2]) < LIMIT_PX
+    assert reprojection_px(capture, load(tmp_path / "back", UserInputs(), Convention())[2]) < LIMIT_PX
 
 
 @pytest.mark.parametrize(
@@ -181,7 +181,7 @@ def test_a_file_that_holds_the_inverse_is_read_so(tmp_path):
     options = ("--from-axes", "opencv", "--from-inverted")
     result = nerfcli("convert", tmp_path / "wrong.json", tmp_path / "out", "--to", "colmap", *options)
     assert result.exit_code == 0, result.stderr
-    assert reprojection_px(capture, load(tmp_path / "out", UserInputs(), ConventionOverrides())[2]) < LIMIT_PX
+    assert reprojection_px(capture, load(tmp_path / "out", UserInputs(), Convention())[2]) < LIMIT_PX
 
 
 def test_intrinsics_for_another_size(tmp_path):
@@ -191,7 +191,7 @@ def test_intrinsics_for_another_size(tmp_path):
     result = nerfcli("convert", source, tmp_path / "out", "--to", "colmap", "--from-size", "2")
     assert result.exit_code == 0
     assert "principal point" not in result.stderr
-    assert load(tmp_path / "out", UserInputs(), ConventionOverrides())[2].frames[0].camera == PINHOLE
+    assert load(tmp_path / "out", UserInputs(), Convention())[2].frames[0].camera == PINHOLE
     warned = nerfcli("convert", source, tmp_path / "as-it-is", "--to", "colmap").stderr
     assert "principal point of" in " ".join(warned.split())
     assert "--from-size" in warned
@@ -207,7 +207,7 @@ def test_the_world_frame_and_its_scale(tmp_path):
     options = ("--origin", "centre-of-cameras", "--world-up", "-y", "--distance", distance, "--json")
     result = nerfcli("convert", model_of(tmp_path, capture), out, "--to", "nerfcli", *options)
     assert result.exit_code == 0, result.stderr
-    again = load(out, UserInputs(), ConventionOverrides())[2]
+    again = load(out, UserInputs(), Convention())[2]
     centres = np.array([frame.centre for frame in again.frames])
     np.testing.assert_allclose(centres.mean(axis=0), 0, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(centres[0] - centres[1]), metres, rtol=1e-12)

@@ -74,14 +74,14 @@ class Convention:
     """Convention of the numbers in a file, where it may differ from that of the format.
 
     Args:
-        axes: the camera axes of the file's poses.
+        axes: the camera axes of the file's poses; "" for those of the format.
         inverted: whether the file holds the inverse of the transform that its format prescribes.
         pixel_centre: the coordinate of the top-left pixel's centre in cx, cy and pixel positions: 0.5, or 0 as in
             OpenCV.
         intrinsics_scale: the size of the picture that the intrinsics are for, over the size that the file states.
     """
 
-    axes: str
+    axes: str = ""
     inverted: bool = False
     pixel_centre: float = 0.5
     intrinsics_scale: float = 1.0

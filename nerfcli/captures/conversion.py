@@ -4,7 +4,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
@@ -82,31 +82,17 @@ def differs(what: str) -> UserError:
 
 
 @dataclass(frozen=True)
-class ConventionOverrides:
-    """The user's corrections of the convention; None or the default where the format is right.
-
-    Args: see `Convention`.
-    """
-
-    axes: str | None = None
-    inverted: bool = False
-    pixel_centre: float | None = None
-    intrinsics_scale: float = 1.0
-
-
-@dataclass(frozen=True)
 class TargetOptions:
     """Format and conventions of the written file.
 
     Args:
-        axes, pixel_centre: see `Convention`; None for the format's own.
+        convention: its camera axes and pixel centre.
         allow_loss: whether content that the format cannot hold may be dropped; observations always may.
         pixels: which pixels of EXIF-turned photos the cameras refer to; None for those that programs of the format use.
     """
 
     form: Format
-    axes: str | None = None
-    pixel_centre: float | None = None
+    convention: Convention = field(default_factory=Convention)
     allow_loss: bool = False
     overwrite: bool = False
     pixels: str | None = None
@@ -145,8 +131,8 @@ def recognise_given(source: Path, given: UserInputs) -> tuple[Format, Path]:
     return form, found
 
 
-def load(source: Path, given: UserInputs, overrides: ConventionOverrides) -> tuple[Format, Path, Capture]:
-    """Read the capture in a file or folder, in the convention given by the user.
+def load(source: Path, given: UserInputs, convention: Convention) -> tuple[Format, Path, Capture]:
+    """Read the capture in a file or folder, whose numbers are in a convention.
 
     Returns:
         The format, the file or folder that was parsed, the capture.
@@ -158,12 +144,7 @@ def load(source: Path, given: UserInputs, overrides: ConventionOverrides) -> tup
     capture = form.parse(found, given)
     if given.masks is not None:
         capture = with_masks(capture, given.masks)
-    true_convention = Convention(
-        axes=form.axes if overrides.axes is None else overrides.axes,
-        inverted=overrides.inverted,
-        pixel_centre=0.5 if overrides.pixel_centre is None else overrides.pixel_centre,
-        intrinsics_scale=overrides.intrinsics_scale,
-    )
+    true_convention = replace(convention, axes=convention.axes or form.axes)
     if true_convention != Convention(form.axes):
         capture = reinterpreted(capture, true_convention, parsed_axes=form.axes)
     return form, found, capture
@@ -256,13 +237,12 @@ def _orientation_notes(turned: ReorientedCapture) -> tuple[str, ...]:
 
 def _convention(form: Format, wanted: TargetOptions) -> Convention:
     """Return the convention of the file to be written."""
-    axes = form.axes if wanted.axes is None else wanted.axes
+    axes, pixel_centre = wanted.convention.axes or form.axes, wanted.convention.pixel_centre
     if not np.array_equal(opencv_from_axes(axes), opencv_from_axes(form.axes)) and not form.open_axes:
         raise UserError(
             f"{form.name} prescribes the camera axes {form.axes}, not {axes}",
             "remove --axes; programs that read this format expect its own axes",
         )
-    pixel_centre = 0.5 if wanted.pixel_centre is None else wanted.pixel_centre
     if pixel_centre != 0.5 and not form.open_centre:
         raise UserError(
             f"{form.name} prescribes the pixel convention: the top-left pixel's centre is (0.5, 0.5)",

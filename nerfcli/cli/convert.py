@@ -13,7 +13,8 @@ from nerfcli.cli.options import Overwrite, Printing, one_of
 from nerfcli.output import beside
 
 if TYPE_CHECKING:
-    from nerfcli.captures.conversion import ConventionOverrides, TargetOptions
+    from nerfcli.captures.axes import Convention
+    from nerfcli.captures.conversion import TargetOptions
     from nerfcli.captures.detect import Detection, HypothesisScore, Question
     from nerfcli.captures.formats.format import UserInputs
     from nerfcli.captures.world import WorldFrame
@@ -85,16 +86,16 @@ class SourceOptions:
         ),
     ] = None
 
-    def overrides(self) -> "ConventionOverrides":
-        """Return the conventions of the source.
+    def convention(self) -> "Convention":
+        """Return the convention of the source.
 
         Raises:
             typer.BadParameter: a value is unknown.
         """
-        from nerfcli.captures.conversion import ConventionOverrides
+        from nerfcli.captures.axes import Convention
 
         centre = _pixel_centre(self.from_pixel_center, "--from-pixel-center")
-        return ConventionOverrides(self.from_axes, self.from_inverted, centre, self.from_size)
+        return Convention(self.from_axes or "", self.from_inverted, centre, self.from_size)
 
     def given(self) -> "UserInputs":
         """Return photos, masks and camera; reads the file of intrinsics."""
@@ -171,6 +172,7 @@ class FormatOptions:
         Raises:
             typer.BadParameter: a value is missing or unknown.
         """
+        from nerfcli.captures.axes import Convention
         from nerfcli.captures.conversion import TargetOptions
         from nerfcli.captures.formats.registry import format_named
 
@@ -179,8 +181,8 @@ class FormatOptions:
             stated = "missing" if to is None else repr(to)
             raise typer.BadParameter(f"{stated}; choose one of {', '.join(FORMATS_WRITTEN)}", param_hint="--to")
         one_of(self.pixels, ("stored", "upright"), "--pixels")
-        centre = _pixel_centre(self.pixel_center, "--pixel-center")
-        return TargetOptions(format_named(to), self.axes, centre, self.allow_loss, self.overwrite, self.pixels)
+        convention = Convention(self.axes or "", pixel_centre=_pixel_centre(self.pixel_center, "--pixel-center"))
+        return TargetOptions(format_named(to), convention, self.allow_loss, self.overwrite, self.pixels)
 
 
 @command
@@ -236,7 +238,7 @@ def convert(
       nerfcli convert capture.zip office-scene --to nerfcli
       ls -d captures/*/ | nerfcli convert - converted/ --to transforms
     """
-    console, overrides = printing.console, read.overrides()
+    console, convention = printing.console, read.convention()
     if detect:
         if written.to is not None or target is not None:
             raise typer.BadParameter("--detect writes nothing; remove OUT and --to")
@@ -253,7 +255,7 @@ def convert(
             place_of(given, target),
             wanted,
             given=read.given(),
-            overrides=overrides,
+            convention=convention,
             world=frame,
             reporter=console.reporter,
         )
@@ -268,7 +270,7 @@ def _detect(path: Path, read: SourceOptions, console: Console) -> None:
     from nerfcli.workflows.convert import detect_convention, detection_record
 
     with console.stage(f"detect {path.name}") as reporter:
-        form, found = detect_convention(path, given=read.given(), overrides=read.overrides(), reporter=reporter)
+        form, found = detect_convention(path, given=read.given(), convention=read.convention(), reporter=reporter)
     lines = [f"{path} ({form.name}), judged by {found.evidence}", *_table(found)]
     console.facts(path, detection_record(found, form.name), "\n".join(lines))
 
@@ -314,8 +316,8 @@ def _verdict(question: "Question") -> str:
     return f"fits, {question.ratio:.3g} times better than the next"
 
 
-def _pixel_centre(text: str | None, option: str) -> float | None:
-    return None if text is None else PIXEL_CENTRES[one_of(text, PIXEL_CENTRES, option)]
+def _pixel_centre(text: str | None, option: str) -> float:
+    return PIXEL_CENTRES[one_of("0.5" if text is None else text, PIXEL_CENTRES, option)]
 
 
 def place_of(given: Given, target: Path) -> Path:

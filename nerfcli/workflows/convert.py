@@ -7,10 +7,10 @@ from typing import Any
 
 from nerfcli.captures import detect
 from nerfcli.captures.archives import unpacked
+from nerfcli.captures.axes import Convention
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.conversion import (
     TOLERANCE_PX,
-    ConventionOverrides,
     Conversion,
     TargetOptions,
     accepted_losses,
@@ -36,7 +36,7 @@ def convert_capture(
     wanted: TargetOptions,
     *,
     given: UserInputs = UserInputs(),
-    overrides: ConventionOverrides = ConventionOverrides(),
+    convention: Convention = Convention(),
     world: WorldFrame = WorldFrame(),
     reporter: Reporter = Reporter(),
 ) -> tuple[Conversion, dict[str, Any]]:
@@ -45,7 +45,7 @@ def convert_capture(
     Args:
         source: a file or folder in a known format.
         given: photos, masks and cameras that the source does not name.
-        overrides: conventions of the source that differ from those of its format.
+        convention: that of the numbers in the source.
 
     Raises:
         UserError: the capture cannot be read or written, the format cannot hold it, or what was written differs.
@@ -56,7 +56,7 @@ def convert_capture(
         refuse_missing_masks(given.masks)
     source = unpacked(source, Output(target, wanted.overwrite), reporter=reporter)
     given = _with_frames(source, target, wanted, given=given, world=world, reporter=reporter)
-    form, found, capture = load(source, given, overrides)
+    form, found, capture = load(source, given, convention)
     reporter.note(f"{found}: {form.name}, {contents(capture)}")
     for text in capture.notes:
         reporter.warn(text)
@@ -149,7 +149,7 @@ def detect_convention(
     source: Path,
     *,
     given: UserInputs = UserInputs(),
-    overrides: ConventionOverrides = ConventionOverrides(),
+    convention: Convention = Convention(),
     reporter: Reporter = Reporter(),
 ) -> tuple[Format, detect.Detection]:
     """Detect the format of a capture, and the convention that its numbers follow.
@@ -157,7 +157,7 @@ def detect_convention(
     Raises:
         UserError: the capture cannot be read, or there is too little evidence.
     """
-    form, found, capture = load(source, given, overrides)
+    form, found, capture = load(source, given, convention)
     reporter.note(f"{found}: {form.name}, {contents(capture)}")
     for text in capture.notes:
         reporter.warn(text)
