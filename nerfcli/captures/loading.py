@@ -17,7 +17,7 @@ from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.captures.holdout import HELD_OUT_EVERY, default_split, names_held_out
-from nerfcli.captures.orientation import UPRIGHT, counted, measure_of, rescaling, upright
+from nerfcli.captures.orientation import UPRIGHT, counted, rescaling, upright
 from nerfcli.errors import UserError, in_shell
 from nerfcli.photos.masks import masks_inside
 
@@ -135,7 +135,7 @@ def _upright(capture: Capture, frame: Frame) -> Frame:
     """Return a frame fitted to its upright photo on disk."""
     if frame.mask is not None and not frame.mask.is_file():
         raise UserError(f"{frame.mask}, the mask of {frame.name}, does not exist", "restore it, or remove its entry")
-    return upright(frame, measure_of(capture))
+    return upright(frame, capture.pixels)
 
 
 def refuse_without_training_photos(scene: Capture) -> None:

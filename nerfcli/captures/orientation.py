@@ -6,7 +6,7 @@ that refers to the stored pixels is turned together with its picture, about its 
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,9 +19,8 @@ from nerfcli.errors import UserError
 from nerfcli.photos.exif import read_exif
 from nerfcli.photos.images import image_size
 
-# Returns an image file's width and height, EXIF orientation applied, and that orientation (1 if none).
+# An image file's width and height, EXIF orientation applied, and that orientation (1 if none).
 Measured = tuple[int, int, int]
-Measure = Callable[[Path], Measured]
 
 # Rotations upright_from_stored of the picture, in (x right, y down): EXIF 3 is half a turn, 6 a quarter clockwise,
 # 8 a quarter counter-clockwise. Source: Exif 2.32, tag 0x0112.
@@ -164,16 +163,15 @@ class ReorientedCapture:
     masks_left_out: tuple[str, ...] = ()
 
 
-def measure(path: Path) -> tuple[int, int, int]:
-    """Return the width and height of a photo shown upright, and its EXIF orientation."""
+def measure(path: Path) -> Measured:
+    """Read the size of a photo and its EXIF orientation."""
     exif = read_exif(path)
     return exif.width, exif.height, exif.orientation
 
 
-def measure_of(capture: Capture) -> Measure:
-    """Return the function that measures photos so that a capture's cameras can be fitted to the upright photos."""
-    # Cameras of upright photos have orientation 1: nothing is left to turn.
-    return (lambda path: (*image_size(path), 1)) if capture.pixels == UPRIGHT else measure
+def _measured(path: Path, pixels: str) -> Measured:
+    """Measure a photo for a camera that refers to these pixels: for one of upright photos, nothing is left to turn."""
+    return (*image_size(path), 1) if pixels == UPRIGHT else measure(path)
 
 
 def in_pixels(capture: Capture, pixels: str) -> ReorientedCapture:
@@ -208,10 +206,11 @@ def in_pixels(capture: Capture, pixels: str) -> ReorientedCapture:
     return ReorientedCapture(turned_capture, int((turns != 1).sum()), num_unknown, tuple(masks_left_out))
 
 
-def upright(frame: Frame, measure: Measure) -> Frame:
-    """Return a frame fitted to its upright photo on disk; its camera may be for another size or the stored pixels."""
+def upright(frame: Frame, pixels: str) -> Frame:
+    """Return a frame fitted to its upright photo on disk, whose camera refers to stored or upright pixels."""
     assert frame.image is not None
-    camera, pose = fit_to_picture(frame.camera, frame.world_from_cam, path=frame.image, measured=measure(frame.image))
+    measured = _measured(frame.image, pixels)
+    camera, pose = fit_to_picture(frame.camera, frame.world_from_cam, path=frame.image, measured=measured)
     return replace(frame, camera=camera, world_from_cam=pose)
 
 
@@ -230,7 +229,7 @@ def other_sizes(capture: Capture) -> dict[tuple[Size, Size], int]:
             continue
         assert frame.image is not None
         try:
-            measured = measure_of(capture)(frame.image)
+            measured = _measured(frame.image, capture.pixels)
             turn_to_upright(frame.camera, measured, path=frame.image)
         except UserError:  # the commands that use the photos say what is wrong with them
             continue

@@ -14,7 +14,7 @@ from nerfcli.cameras.rigid import Similarity
 from nerfcli.captures.axes import poses_of
 from nerfcli.captures.boards import CharucoBoard, scale_from_charuco, scale_from_markers
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.orientation import UPRIGHT, in_pixels, measure_of, upright
+from nerfcli.captures.orientation import UPRIGHT, in_pixels, upright
 from nerfcli.captures.scale import (
     ScaleEstimate,
     gps_positions,
@@ -171,7 +171,7 @@ def _estimate(capture: Capture, wanted: WorldFrame) -> ScaleEstimate | None:
         return scale_from_distances([known_distance(text, capture.frames) for text in wanted.distances])
     frames = [frame for frame in capture.frames if frame.has_photo]
     if wanted.markers is not None:
-        return _scale_from_markers([upright(frame, measure_of(capture)) for frame in frames], wanted.markers)
+        return _scale_from_markers([upright(frame, capture.pixels) for frame in frames], wanted.markers)
     if wanted.scale == GPS:
         return scale_from_gps(frames, gps_positions(frames))
     return None

@@ -273,8 +273,7 @@ def _focals_px(subject: ExaminedCapture, photos: Sequence[PhotoFacts], calibrati
     if calibration is not None:
         paths = {source.name: source.path for source in subject.sources}
         pictures = [
-            Picture(paths[photo.name], photo.exif.width, photo.exif.height, photo.exif.orientation or 1)
-            for photo in photos
+            Picture(paths[photo.name], photo.exif.width, photo.exif.height, photo.exif.orientation) for photo in photos
         ]
         cameras = [found.camera for found in calibrated(calibration, pictures)]
     elif subject.scene is not None:

@@ -88,10 +88,7 @@ def group_by_given(photos: Photos, calibration: Calibration) -> PhotoGroups:
     Raises:
         UserError: a photo has no camera in the file, or one that cannot be.
     """
-    pictures = [
-        Picture(photos.folder / photo.name, photo.width, photo.height, photo.exif.orientation or 1)
-        for photo in photos.photos
-    ]
+    pictures = [Picture(photos.folder / p.name, p.width, p.height, p.exif.orientation) for p in photos.photos]
     found = calibrated(calibration, pictures)
     for one in found:
         if one.camera.is_spherical and one.camera.width != 2 * one.camera.height:
