@@ -50,6 +50,8 @@ _UPRIGHT_FROM_STORED = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
+# Steps along rows and columns after the axes were swapped, as 5 alone does.
+_STEPS_AFTER_SWAP = {5: (1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}
 # Exceptions of Pillow's decoders for damaged files; no common base class is documented.
 _DAMAGED = (
     *(OSError, EOFError, SyntaxError, ValueError, TypeError, LookupError, RuntimeError),
@@ -125,11 +127,10 @@ def read_image(path: Path) -> np.ndarray:
         return np.array(srgb)
 
 
-def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Rotate and mirror stored pixels, uint8 (H, W) or (H, W, 3 or 4), according to an EXIF orientation (1...8)."""
-    _check_pixels(pixels)
-    transpose = _UPRIGHT_FROM_STORED.get(orientation)
-    return pixels if transpose is None else np.array(Image.fromarray(pixels).transpose(transpose))
+def upright(stored: np.ndarray, orientation: int) -> np.ndarray:
+    """Turn an array (H, W) of stored pixels by an EXIF orientation that swaps its sides: 5...8."""
+    down, across = _STEPS_AFTER_SWAP[orientation]
+    return np.ascontiguousarray(stored.T[::down, ::across])
 
 
 def downscale(image: np.ndarray, factor: float) -> np.ndarray:

@@ -22,6 +22,7 @@ from numpy.lib import format as npy_format
 from nerfcli.cameras.frame import SensorDepth
 from nerfcli.errors import UserError, reason_of
 from nerfcli.photos.exif import read_exif
+from nerfcli.photos.images import upright
 
 # Neighbours whose depths differ by more than this factor are the two sides of an edge, where sensors mix both: surfaces
 # at 75 degrees from the line of sight stay below at 256 pixels for 60 degrees.
@@ -31,8 +32,6 @@ SAME_SHAPE = 0.03
 
 _HINT = "restore the file, or train with --no-sensor-depth"
 _UNKNOWN_LEVEL = 65535
-# By EXIF orientation, the steps along columns and rows after the axes were swapped.
-_MIRRORED = {5: (1, 1), 6: (-1, 1), 7: (-1, -1), 8: (1, -1)}
 
 
 @dataclass(frozen=True)
@@ -64,9 +63,7 @@ def read_sensor_depth(depth: SensorDepth, photo: Path) -> DepthReadings:
     confidence = np.ones_like(z) if depth.confidence is None else _confidence(depth.confidence, z.shape)
     z = np.where(confidence > 0, _without_edges(z), np.nan)
     if exif.orientation >= 5 and _is_shaped(z, stored) and not _is_shaped(z, stored[::-1]):
-        # As in `photos.images.upright`: mirrored at a diagonal, and then, but for 5, at one axis or both.
-        across, down = _MIRRORED[exif.orientation]
-        z, confidence = (np.ascontiguousarray(values.T[::down, ::across]) for values in (z, confidence))
+        z, confidence = upright(z, exif.orientation), upright(confidence, exif.orientation)
     if not _is_shaped(z, (exif.width, exif.height)):
         shape = f"{z.shape[1]}x{z.shape[0]}, which is not the shape of its {exif.width}x{exif.height} photo"
         raise UserError(f"{depth.path} is {shape}", _HINT)
