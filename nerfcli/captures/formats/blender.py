@@ -16,12 +16,7 @@ from nerfcli.captures.axes import pose_in_axes
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import check_unique_names, read_json_object
 from nerfcli.captures.formats.format import Format, UserInputs
-from nerfcli.captures.formats.transforms import (
-    SPLITS,
-    listed_frames,
-    records_of,
-    relative_path,
-)
+from nerfcli.captures.formats.transforms import SPLITS, listed_frames, records_of, relative_path
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
 from nerfcli.errors import UserError
 
@@ -57,12 +52,7 @@ def losses_blender(capture: Capture) -> tuple[str, ...]:
     """
     sizes = sum(frame.image is None for frame in capture.frames)
     lost = lost_of_cameras(capture, lost_to_pinhole)
-    off = sum(
-        camera_angle != shared
-        for split, frames in _by_split(capture).items()
-        for shared in [_shared_angle(frames)]
-        for camera_angle in map(_angle, frames)
-    )
+    off = sum(len(frames) - _most_common_angle(frames)[1] for frames in _by_split(capture).values())
     lost += [f"the field of view of {off} frames (one per file)"] if off else []
     lost += [f"the picture's size of {sizes} frames"] if sizes else []
     return (*lost, *lost_parts(capture, holds=("splits",)))
@@ -85,7 +75,7 @@ def write_blender(capture: Capture, folder: Path) -> None:
             }
             for frame in frames
         ]
-        write_json(_file(folder, split), {"camera_angle_x": _shared_angle(frames), "frames": records})
+        write_json(_file(folder, split), {"camera_angle_x": _most_common_angle(frames)[0], "frames": records})
 
 
 def _file(folder: Path, split: str) -> Path:
@@ -93,12 +83,8 @@ def _file(folder: Path, split: str) -> Path:
 
 
 def _by_split(capture: Capture) -> dict[str, list[Frame]]:
-    by_split: dict[str, list[Frame]] = {}
-    for split in SPLITS:
-        frames = [frame for frame in capture.frames if (frame.split or "train") == split]
-        if frames:
-            by_split[split] = frames
-    return by_split
+    by_split = {split: [f for f in capture.frames if (f.split or "train") == split] for split in SPLITS}
+    return {split: frames for split, frames in by_split.items() if frames}
 
 
 def _file_path(frame: Frame, folder: Path) -> str:
@@ -113,13 +99,14 @@ def _angle(frame: Frame) -> float:
     return 2 * math.atan(frame.camera.width / 2 / frame.camera.focal_lengths[0])
 
 
-def _shared_angle(frames: list[Frame]) -> float:
-    return Counter(map(_angle, frames)).most_common(1)[0][0]
+def _most_common_angle(frames: list[Frame]) -> tuple[float, int]:
+    """Return the angle that most frames have, and how many do."""
+    return Counter(map(_angle, frames)).most_common(1)[0]
 
 
 def find_blender(path: Path) -> Path | None:
     """Find a folder with a file of the Blender scenes."""
-    return path if any((path / f"transforms_{split}.json").is_file() for split in ("train", "test", "val")) else None
+    return path if any(_file(path, split).is_file() for split in SPLITS) else None
 
 
 FORMAT = Format(
