@@ -142,8 +142,7 @@ def _camera(record: dict[str, Any], where: str, version: tuple[int, ...]) -> Cam
     terms = record.get("distortionParams") or []  # an empty list is written as an empty text
     values = [*_numbers(terms, len(terms) if isinstance(terms, list) else 0, f"{where}: distortionParams"), *(0.0,) * 5]
     if kind in _FISHEYE:
-        radial = (values[0], values[1], values[2], values[3])
-        return lenses.fisheye_camera(size, focal, centre, radial=radial, where=where)
+        return lenses.fisheye_camera(size, focal, centre, radial=values[:4], where=where)
     if kind not in _RADIAL:
         supported = ", ".join((*_RADIAL, *_FISHEYE))
         raise malformed(where, f"a lens of type {shown(kind)} is not supported", f"expected one of {supported}")

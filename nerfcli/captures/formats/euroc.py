@@ -104,8 +104,7 @@ def _sensor(path: Path) -> tuple[Camera, np.ndarray]:
         what = f"camera_model is {shown(model)}, distortion_model {shown(kind)} with {several(len(values), 'term')}"
         raise malformed(where, what, "expected pinhole with radial-tangential (k1, k2, p1, p2) or equidistant")
     if kind in _FISHEYE:
-        radial = (values[0], values[1], values[2], values[3])
-        return lenses.fisheye_camera(size, (fx, fy), (cx, cy), radial=radial, where=where), body_from_cam
+        return lenses.fisheye_camera(size, (fx, fy), (cx, cy), radial=values, where=where), body_from_cam
     k1, k2, p1, p2, k3 = values + [0.0] * (5 - len(values))
     lens = lenses.brown_camera(size, (fx, fy), (cx, cy), radial=(k1, k2, k3), tangential=(p1, p2), where=where)
     return lens, body_from_cam

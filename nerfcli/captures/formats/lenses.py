@@ -7,6 +7,7 @@ grow with the radius. Mostly they move no pixel by a tenth of its width once the
 do, the lens is refused.
 """
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -30,11 +31,11 @@ def brown_camera(
     focal: Pair,
     centre: Pair,
     *,
-    radial: tuple[float, float, float],
-    tangential: Pair = (0.0, 0.0),
+    radial: Sequence[float],
+    tangential: Sequence[float] = (0.0, 0.0),
     where: str,
 ) -> Camera:
-    """Return a perspective camera with Brown's distortion.
+    """Return a perspective camera with Brown's distortion, k1 to k3.
 
     With x = X/Z, y = Y/Z, r^2 = x^2 + y^2:
         u = fx (x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)) + cx
@@ -64,12 +65,12 @@ def fisheye_camera(
     focal: Pair,
     centre: Pair,
     *,
-    radial: tuple[float, float, float, float],
-    tangential: Pair = (0.0, 0.0),
+    radial: Sequence[float],
+    tangential: Sequence[float] = (0.0, 0.0),
     prism: Pair = (0.0, 0.0),
     where: str,
 ) -> Camera:
-    """Return a camera with equidistant projection and Brown's distortion, thin prisms (sx, sy) included.
+    """Return a camera with equidistant projection and Brown's distortion, k1 to k4, thin prisms (sx, sy) included.
 
     With R = sqrt(X^2 + Y^2), t = atan2(R, Z), x = t X/R, y = t Y/R, r^2 = x^2 + y^2:
         u = fx (x (1 + k1 r^2 + ... + k4 r^8) + 2 p1 x y + p2 (r^2 + 2 x^2) + sx r^2) + cx
@@ -84,15 +85,6 @@ def fisheye_camera(
         params = (*focal, *centre, *radial[:2], *tangential, *radial[2:], *prism)
         return checked_camera("THIN_PRISM_FISHEYE", *size, params, where=where)
     return checked_camera("OPENCV_FISHEYE", *size, (*focal, *centre, *radial), where=where)
-
-
-def spherical_camera(size: tuple[int, int], where: str) -> Camera:
-    """Return the camera of a panorama of the whole sphere: pixels are equal steps of longitude and latitude.
-
-    Raises:
-        UserError: the picture is not twice as wide as high, so it cannot show the whole sphere.
-    """
-    return checked_camera("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), where=where)
 
 
 # The largest distance of a pixel that is accepted.
@@ -147,12 +139,12 @@ class Fits:
         Raises:
             UserError: the best fit is off by more than `MOST_OFF_PX`; the terms and `where` are named.
         """
-        k1, k2, k3, _ = terms.radial
-        plain = brown_camera(size, focal, centre, radial=(k1, k2, k3), tangential=terms.tangential, where=where)
+        radial, tangential = terms.radial[:3], terms.tangential
+        plain = brown_camera(size, focal, centre, radial=radial, tangential=tangential, where=where)
         if not terms.beyond_brown:
             return plain
-        p1, p2 = terms.tangential
-        start = checked_camera("FULL_OPENCV", *size, (*focal, *centre, k1, k2, p1, p2, k3, 0, 0, 0), where=where)
+        params = (*focal, *centre, *radial[:2], *tangential, radial[2], 0, 0, 0)
+        start = checked_camera("FULL_OPENCV", *size, params, where=where)
         return self._accepted(_best(plain, start, terms), terms.beyond_brown, where)
 
     def fisheye(self, size: Size, focal: Pair, centre: Pair, *, terms: Terms, where: str) -> Camera:

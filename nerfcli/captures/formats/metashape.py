@@ -35,8 +35,8 @@ from nerfcli.captures.formats.fields import (
     size_of,
 )
 from nerfcli.captures.formats.format import Format, by_suffix
-from nerfcli.captures.formats.lenses import Fits, Terms, spherical_camera
-from nerfcli.captures.formats.limits import FramePoses, rigid_pose
+from nerfcli.captures.formats.lenses import Fits, Terms
+from nerfcli.captures.formats.limits import FramePoses, checked_camera, rigid_pose
 from nerfcli.captures.formats.photo_names import with_photos
 from nerfcli.errors import listed as in_words
 from nerfcli.errors import several
@@ -215,7 +215,7 @@ def _camera(sensor: Element, where: str, fits: Fits) -> Camera:
     width, height = numbers([resolution.get("width", ""), resolution.get("height", "")], 2, f"{where}: resolution")
     size = size_of(width, height, where)
     if kind == _SPHERICAL:
-        return spherical_camera(size, where)
+        return checked_camera("EQUIRECTANGULAR", *size, size, where=where)
     if kind != _FRAME and kind not in _FISHEYE:
         supported = ", ".join((_FRAME, *_FISHEYE, _SPHERICAL))
         raise malformed(where, f"camera type {shown(kind)} is not supported", f"expected one of {supported}")

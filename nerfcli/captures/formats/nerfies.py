@@ -80,6 +80,7 @@ def _names(content: dict[str, Any], key: str, path: Path) -> list[str]:
 
 def _camera(record: dict[str, Any], where: str) -> Camera:
     width, height = vector(record, "image_size", 2, where).tolist()
+    size = size_of(width, height, where)
     focal, skew = number(record, "focal_length", where), number(record, "skew", where, default=0.0)
     aspect = number(record, "pixel_aspect_ratio", where, default=1.0)
     if abs(skew) > 1e-6 * abs(focal):
@@ -87,14 +88,8 @@ def _camera(record: dict[str, Any], where: str) -> Camera:
     x, y = vector(record, "principal_point", 2, where).tolist()
     radial = _terms(record, ("radial_distortion",), 3, where)
     tangential = _terms(record, ("tangential", "tangential_distortion"), 2, where)
-    return lenses.brown_camera(
-        size_of(width, height, where),
-        (focal, focal * aspect),
-        (x, y),
-        radial=(radial[0], radial[1], radial[2]),
-        tangential=(tangential[0], tangential[1]),
-        where=where,
-    )
+    lens = (focal, focal * aspect), (x, y)
+    return lenses.brown_camera(size, *lens, radial=radial, tangential=tangential, where=where)
 
 
 def _terms(record: dict[str, Any], keys: tuple[str, ...], count: int, where: str) -> list[float]:

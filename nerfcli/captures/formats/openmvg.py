@@ -34,7 +34,7 @@ from nerfcli.captures.formats.fields import (
     vector,
 )
 from nerfcli.captures.formats.format import Format, UserInputs, has_keys, named
-from nerfcli.captures.formats.limits import FramePoses, plausible, without
+from nerfcli.captures.formats.limits import FramePoses, checked_camera, plausible, without
 from nerfcli.captures.formats.photo_names import with_photos
 
 FILES = ("sfm_data.json", *(f"reconstruction{name}/sfm_data.json" for name in ("", "_sequential", "_global")))
@@ -113,7 +113,7 @@ def _cameras(content: dict[str, Any], path: Path) -> dict[int, Camera]:
 def _camera(kind: Any, data: dict[str, Any], where: str) -> Camera:
     size = size_of(number(data, "width", where), number(data, "height", where), where)
     if kind == _SPHERICAL:
-        return lenses.spherical_camera(size, where)
+        return checked_camera("EQUIRECTANGULAR", *size, size, where=where)
     if kind not in _TERMS:
         supported = ", ".join((*_TERMS, _SPHERICAL))
         raise malformed(where, f"polymorphic_name is {shown(kind)}", f"expected one of {supported}")
@@ -122,7 +122,7 @@ def _camera(kind: Any, data: dict[str, Any], where: str) -> Camera:
     focal = (number(data, "focal_length", where),) * 2
     x, y = vector(data, "principal_point", 2, where).tolist()
     if kind == "fisheye":
-        return lenses.fisheye_camera(size, focal, (x, y), radial=tuple(terms), where=where)
+        return lenses.fisheye_camera(size, focal, (x, y), radial=terms, where=where)
     k1, k2, k3, p1, p2 = terms + [0.0] * (5 - count)
     return lenses.brown_camera(size, focal, (x, y), radial=(k1, k2, k3), tangential=(p1, p2), where=where)
 

@@ -167,7 +167,7 @@ def _camera(value: Any, where: str) -> Camera:
     kind = kind.lower() if isinstance(kind, str) else kind
     size = size_of(number(record, "width", where), number(record, "height", where), where)
     if kind in _SPHERICAL:
-        return lenses.spherical_camera(size, where)
+        return checked_camera("EQUIRECTANGULAR", *size, size, where=where)
     if kind not in tuple(_TERMS):
         supported = ", ".join((*_TERMS, *_SPHERICAL))
         raise malformed(where, f"projection_type {shown(kind)} is not supported", f"expected one of {supported}")

@@ -60,7 +60,7 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
     model = record.get("camera_model")
     model = model.strip().upper() if isinstance(model, str) else model
     if model == "EQUIRECTANGULAR":
-        return lenses.spherical_camera(size, where)
+        return checked_camera(model, *size, size, where=where)
     foreign = next((key for key in _FOREIGN if record.get(key) not in (None, False)), None)
     if foreign is not None:
         raise malformed(where, f"the lens model of {foreign} is not supported", "undistort the pictures first")
