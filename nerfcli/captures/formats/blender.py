@@ -62,9 +62,6 @@ def write_blender(capture: Capture, folder: Path) -> None:
     """Write a capture as transforms_{train,val,test}.json, for the splits that it has.
 
     Frames without a split are written to train. The angle of a file is the one that most of its frames have.
-
-    Raises:
-        UserError: a spherical camera, or a file that cannot be written.
     """
     refuse_spherical(capture, "field of view")
     for split, frames in _by_split(capture).items():

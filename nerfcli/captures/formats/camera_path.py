@@ -53,11 +53,7 @@ def is_camera_path(content: dict[str, Any]) -> bool:
 
 
 def read_path(path: Path) -> CameraPath:
-    """Read the path in a nerfstudio camera-path JSON; without fps or seconds it has 24 frames per second.
-
-    Raises:
-        UserError: the file is malformed; file and field are named.
-    """
+    """Read the path in a nerfstudio camera-path JSON; without fps or seconds it has 24 frames per second."""
     content = read_json_object(path)
     kind = content.get("camera_type", "perspective")
     if not isinstance(kind, str) or kind.lower() not in _MODELS:

@@ -182,22 +182,13 @@ def write_colmap_binary(capture: Capture, path: Path) -> None:
     """Write a capture as cameras.bin, images.bin and points3D.bin into the folder `path`, all or none.
 
     Ids count from 1 in the order of the frames, equal cameras have one id, points without colours are black and their
-    reprojection errors -1 (not measured), as in COLMAP.
-
-    Raises:
-        UserError: a name that the files cannot hold, or a folder that cannot be written or holds other files.
+    reprojection errors -1 (not measured), as in COLMAP. A folder with other files is refused.
     """
     _write(capture, path, ".bin", wrong=[f.name for f in capture.frames if not f.name or "\0" in f.name])
 
 
 def write_colmap_text(capture: Capture, path: Path) -> None:
-    """Write a capture as cameras.txt, images.txt and points3D.txt into the folder `path`, all or none.
-
-    As `write_colmap_binary`; numbers are written with full precision.
-
-    Raises:
-        UserError: a name that the files cannot hold, or a folder that cannot be written or holds other files.
-    """
+    """Write cameras.txt, images.txt and points3D.txt as `write_colmap_binary` does, with numbers in full precision."""
     names = [frame.name for frame in capture.frames]
     wrong = [name for name in names if not name or name != name.strip() or "\n" in name or "\r" in name]
     _write(capture, path, ".txt", wrong=wrong)

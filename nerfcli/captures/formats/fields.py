@@ -1,6 +1,8 @@
-"""Read numbers and texts from files that may be damaged; every problem is one error that names file and field.
+"""Read numbers and texts from files that may be damaged.
 
-`where` is always the file and the place in it, such as "poses.txt: line 3"; it begins the message.
+Whatever is missing, or not as a function expects it, is one `UserError` that names file and field. `where` is always
+the file and the place in it, such as "poses.txt: line 3", and begins the message; `expected` is the hint. If the value
+is what programs write where a number is not known, the error is a `NotFiniteError`.
 """
 
 import codecs
@@ -63,11 +65,7 @@ def _encoding(data: bytes) -> str:
 
 
 def read_text(path: Path, expected: str) -> str:
-    """Read the text of a file in UTF-8, with or without a byte order mark, or in UTF-16 with one.
-
-    Raises:
-        UserError: the file is missing, not readable, or not text; `expected` says what it should have been.
-    """
+    """Read the text of a file in UTF-8, with or without a byte order mark, or in UTF-16 with one."""
     try:
         return decoded(path.read_bytes())
     except OSError as error:
@@ -77,11 +75,7 @@ def read_text(path: Path, expected: str) -> str:
 
 
 def read_json(path: Path, expected: str) -> Any:
-    """Read the value that a JSON file holds.
-
-    Raises:
-        UserError: as for `read_text`, or the text is not JSON, or is too deeply nested.
-    """
+    """Read the value that a JSON file holds."""
     text = read_text(path, expected)
     try:
         return json.loads(text)
@@ -93,20 +87,14 @@ def read_json(path: Path, expected: str) -> Any:
 
 
 def read_json_object(path: Path) -> dict[str, Any]:
-    """Read the JSON object in a file.
-
-    Raises:
-        UserError: the file cannot be read, is not JSON, or does not hold an object.
-    """
+    """Read the JSON object in a file."""
     return record_of(read_json(path, "expected a JSON file"), str(path))
 
 
 def read_xml(path: Path, expected: str) -> ElementTree.Element:
     """Read the root of an XML file; tags and attributes keep their prefixes.
 
-    Raises:
-        UserError: the file cannot be read, is not XML, or declares a document type, so that it may have entities to
-            expand; `expected` says what it should have been.
+    A file that declares a document type is refused, as it may have entities to expand.
     """
     try:
         data = path.read_bytes()
@@ -144,21 +132,13 @@ class Row(NamedTuple):
 
 
 def read_rows(path: Path, expected: str, *, separator: str | None = None) -> list[Row]:
-    """Read a table: the lines that are neither empty nor comments, split at the separator, by default at spaces.
-
-    Raises:
-        UserError: see `read_text`.
-    """
+    """Read a table: the lines that are neither empty nor comments, split at the separator, by default at spaces."""
     lines = content_lines(read_text(path, expected))
     return [Row([cell.strip() for cell in line.split(separator)], f"{path}: line {n}") for n, line in lines]
 
 
 def numbers(words: Sequence[str], count: int, where: str) -> list[float]:
-    """Return the numbers of a line of text.
-
-    Raises:
-        UserError: there are more or fewer than `count`, or one of them is not a finite number.
-    """
+    """Return the numbers, of which there must be `count`, that the words of a line are."""
     if len(words) != count:
         found = "1 number" if len(words) == 1 else f"{len(words)} numbers"
         raise malformed(where, f"has {found}", f"expected {count}")
@@ -173,27 +153,19 @@ def numbers(words: Sequence[str], count: int, where: str) -> list[float]:
 
 
 def matrix_of(words: Sequence[str], rows: int, columns: int, where: str) -> np.ndarray:
-    """Return the matrix (rows, columns) of numbers in a text, row by row; errors as of `numbers`."""
+    """Return the matrix (rows, columns) of numbers in a text, row by row."""
     return np.array(numbers(words, rows * columns, where)).reshape(rows, columns)
 
 
 def record_of(value: Any, where: str) -> dict[str, Any]:
-    """Return a JSON object.
-
-    Raises:
-        UserError: the value is not a JSON object.
-    """
+    """Return a value that must be a JSON object."""
     if not isinstance(value, dict):
         raise malformed(where, f"is {shown(value)}", "expected a JSON object {...}")
     return value
 
 
 def number(record: dict[str, Any], key: str, where: str, *, default: float | None = None) -> float:
-    """Return a number of a JSON object, or `default` where the key is absent.
-
-    Raises:
-        UserError: the key is absent and there is no default, or its value is not a finite number.
-    """
+    """Return a number of a JSON object, or `default` where the key is absent."""
     value = _number_of(record.get(key, default))
     if value is None:
         raise _no_value(record, key, where, "expected a number")
@@ -201,11 +173,7 @@ def number(record: dict[str, Any], key: str, where: str, *, default: float | Non
 
 
 def vector(record: dict[str, Any], key: str, count: int, where: str) -> np.ndarray:
-    """Return a list of `count` numbers of a JSON object, as float64.
-
-    Raises:
-        UserError: the key is absent, or its value is not such a list.
-    """
+    """Return a list of `count` numbers of a JSON object, as float64."""
     value = record.get(key)
     values = [_number_of(item) for item in value] if isinstance(value, list) else []
     if len(values) != count or None in values:
@@ -219,8 +187,7 @@ def vector(record: dict[str, Any], key: str, count: int, where: str) -> np.ndarr
 def matrix(record: dict[str, Any], key: str, rows: tuple[int, ...], columns: int, where: str) -> np.ndarray:
     """Return a matrix of a JSON object, as float64: a list of rows, whose number is one of `rows`, or of all numbers.
 
-    Raises:
-        UserError: the value is not such a list; a `NotFiniteError` if it is absent or empty, or a number is not known.
+    A matrix that is absent or empty is one that is not known.
     """
     value = record.get(key)
     if value is None or value == []:
@@ -233,11 +200,7 @@ def matrix(record: dict[str, Any], key: str, rows: tuple[int, ...], columns: int
 
 
 def size_of(width: float, height: float, where: str) -> tuple[int, int]:
-    """Return the width and height of a picture as integers.
-
-    Raises:
-        UserError: one of them is not a whole number from 1 to `MOST_PIXELS`.
-    """
+    """Return the width and height of a picture as integers, which they must be, from 1 to `MOST_PIXELS`."""
     if not all(1 <= side <= MOST_PIXELS and side == int(side) for side in (width, height)):
         what = f"width and height are {shown(width)} and {shown(height)}"
         raise malformed(where, what, "expected the picture's size in pixels, as integers")
@@ -245,22 +208,14 @@ def size_of(width: float, height: float, where: str) -> tuple[int, int]:
 
 
 def name_of(value: Any, where: str) -> str:
-    """Return the name of an image, with forward slashes.
-
-    Raises:
-        UserError: the value is not text, is empty, or cannot be the name of a file.
-    """
+    """Return the name of an image, a text that can be the name of a file, with forward slashes."""
     if not isinstance(value, str) or not value.strip() or len(value) > _LONGEST_NAME or not _is_plain(value):
         raise malformed(where, f"the image's name is {shown(value)}", "expected the image's path as text")
     return value.strip().replace("\\", "/")
 
 
 def check_unique_names(names: Iterable[str], path: Path) -> None:
-    """Check that no two frames have the same name.
-
-    Raises:
-        UserError: a name is listed twice, or none is listed.
-    """
+    """Check that there are frames, and no two with the same name."""
     seen: set[str] = set()
     for name in names:
         if name in seen:
@@ -322,11 +277,7 @@ _HEADERS = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_ar
 
 
 def members_of_npz(path: Path) -> dict[str, bytes]:
-    """Return the .npy file of each array in an .npz file, by the array's name.
-
-    Raises:
-        UserError: the file is missing or damaged.
-    """
+    """Return the .npy file of each array in an .npz file, by the array's name."""
     try:
         with zipfile.ZipFile(path) as archive:
             return {name.removesuffix(".npy"): archive.read(name) for name in archive.namelist()}

@@ -39,7 +39,8 @@ class Format:
         of: what it is, or which programs write it.
         looked_for: what it is recognised by, in a few words for people; "" for formats that are only written.
         find: returns where such a capture is in a file or folder; None if there is none.
-        parse: reads what `find` found, or what `write` wrote, with the further input of the user.
+        parse: reads what `find` found, or what `write` wrote, with the further input of the user; what is damaged is a
+            `UserError` that names file and field.
         axes: the camera axes of its poses, as three letters or a name.
         open_axes: whether poses with other axes are found in such files, so that --axes makes sense.
         open_centre: whether principal points with other pixel centres are found in such files.
@@ -51,7 +52,8 @@ class Format:
         has_split: whether its files say which photos are held out, for all photos.
         unused_splits: splits whose photos are neither for training nor for evaluation.
         listed_by: the order of frames in its files, as a key to sort by; by default, that of the capture.
-        write, losses: None for formats that are only read.
+        write: writes a capture, each file atomically; what cannot be held or written is a `UserError`.
+        losses: lists what a file cannot hold. Both are None for formats that are only read.
         video: returns the video whose frames are the photos of what `find` found; None where the photos are files.
     """
 

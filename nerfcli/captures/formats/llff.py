@@ -38,9 +38,6 @@ def parse_llff(folder: Path, given: UserInputs = UserInputs()) -> Capture:
 
     The file does not name the photos. They are those of `images`, or of the first image folder that holds one per row.
     If there is no image folder at all, frames are named image000, image001, ... and have no image.
-
-    Raises:
-        UserError: the array is damaged or of another shape, or image folders hold other numbers of images.
     """
     path = folder / FILE
     rows = _read_rows(path)
@@ -85,9 +82,6 @@ def write_llff(capture: Capture, folder: Path) -> None:
     Depth bounds are the capture's own. Where it has none, they are the 0.1th and 99.9th percentile of the depths of the
     points that a view observes, or if there are no observations, of those that lie within its picture. A view without
     two such depths gets the widest bounds of the other views. The horizontal focal length is written.
-
-    Raises:
-        UserError: neither depth bounds nor points, a spherical camera, or a file that cannot be written.
     """
     refuse_spherical(capture, "focal length")
     bounds = _percentile_bounds(capture) if capture.depth_bounds is None else capture.depth_bounds

@@ -56,14 +56,10 @@ def parse_metashape(path: Path) -> Capture:
     Cameras without a label or a transform (not aligned, or a follower in a camera rig), of a sensor that is not
     calibrated, and disabled ones give no frames. If a component lacks a transform to the world, components are
     unrelated to each other, and only the one with the most cameras is read. What is left out is noted.
-    The file does not say where the photos are;
-    a frame's name is the camera's label, and where labels are equal, that of its group before it. The unit stays
-    arbitrary: a component's transform comes from georeferencing (then it is in metres) or from moving the model by
-    hand, and the file does not say which.
 
-    Raises:
-        UserError: the file is damaged (file and field are named), has a lens that no COLMAP model holds, or equal
-            labels.
+    The file does not say where the photos are; a frame's name is the camera's label, and where labels are equal, that
+    of its group before it. The unit stays arbitrary: a component's transform comes from georeferencing (then it is in
+    metres) or from moving the model by hand, and the file does not say which.
     """
     chunk, notes = _chunk(path)
     groups = {camera: group.get("label", "") for group in chunk.iterfind("cameras/group") for camera in group}
@@ -149,9 +145,8 @@ def _one_of(kind: str, counts: Mapping[str, int], kept: str) -> list[str]:
 def _chunk(path: Path) -> tuple[Element, list[str]]:
     """Return the chunk with most cameras that give frames, an enabled one first, and a note on the others.
 
-    If no camera gives a frame, it is the first chunk with cameras, so that the error can say why.
-
-    A chunk is the root's child in an exported file, the root itself in the file of a project.
+    If no camera gives a frame, it is the first chunk with cameras, so that the error can say why. A chunk is the root's
+    child in an exported file, the root itself in the file of a project.
     """
     root = read_xml(path, _EXPECTED)
     chunks = [root] if root.tag == "chunk" else root.findall("chunk")

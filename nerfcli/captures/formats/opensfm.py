@@ -81,9 +81,6 @@ def parse_opensfm(path: Path) -> Capture:
     The photos are where OpenSfM has them, in images/ beside the file. The unit of length is the metre where the file
     has a `reference_lla` other than latitude 0, longitude 0: OpenSfM then aligned the world to GPS positions, east,
     north, up from there. Without GPS it writes zeros, and the unit is arbitrary.
-
-    Raises:
-        UserError: the file is damaged (file and field are named), or has a lens that no COLMAP model holds.
     """
     content, notes = _largest(path)
     camera_records = record_of(content.get("cameras"), f"{path}: cameras")
@@ -111,11 +108,7 @@ def losses_opensfm(capture: Capture) -> tuple[str, ...]:
 
 
 def write_opensfm(capture: Capture, path: Path) -> None:
-    """Write a capture as reconstruction.json, atomically, with full precision.
-
-    Raises:
-        UserError: a lens model without an equivalent in OpenSfM, or a file that cannot be written.
-    """
+    """Write a capture as reconstruction.json, with full precision."""
     keys: dict[Camera, str] = {}
     for frame in capture.frames:
         keys.setdefault(frame.camera, f"camera {len(keys)}")

@@ -39,11 +39,7 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def write_points(capture: Capture, path: Path) -> None:
-    """Write the points of a capture, with their colours if it has any, atomically.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
+    """Write the points of a capture, with their colours if it has any."""
     colours = () if capture.colours is None else zip(_COLOURS[0], capture.colours.T, strict=True)
     write_ply(path, {**dict(zip("xyz", capture.points.astype("<f8").T, strict=True)), **dict(colours)})
 

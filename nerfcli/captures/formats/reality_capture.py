@@ -81,11 +81,9 @@ def parse_reality_capture(path: Path, given: UserInputs = UserInputs()) -> Captu
 
 
 def _table(path: Path) -> tuple[list[str], np.ndarray, list[str], tuple[str, ...]]:
-    """Return the table of the images, without those whose numbers are not finite.
+    """Return the images' names, their numbers (images, 15) as of `_NUMBERS`, their places in the file, and notes.
 
-    Returns:
-        The images' names, their numbers (images, 15) in the order of `_NUMBERS`, their places in the file, and a note
-        about what was left out.
+    Those whose numbers are not finite are left out, and noted.
     """
     lines = read_text(path, _EXPECTED).splitlines()
     start = next((index for index, line in enumerate(lines) if line.lower().startswith(("#name,", "name,"))), None)
@@ -135,9 +133,6 @@ def camera_of_values(value: Mapping[str, float], size: tuple[int, int], where: s
     Args:
         value: f in mm on a frame 36 mm long, px, py, k1, ..., k4, t1 and t2; where the file has them, skew as a
             fraction of the longer side, and aspect, fy over fx.
-
-    Raises:
-        UserError: no lens here fits the terms, or a number is invalid; `where` is named.
     """
     scale = max(size)
     focal = value["f"] / 36 * scale

@@ -67,11 +67,7 @@ def read_cameras(run: Path) -> RunCameras:
 
 
 def read_given_cameras(run: Path) -> RunCameras:
-    """Return the frames of a run as the scene had them, before training refined them.
-
-    Raises:
-        UserError: see `read_cameras`.
-    """
+    """Return the frames of a run as `read_cameras`, but as the scene had them, before training refined them."""
     return _read_frames(run / CAMERAS, given=True)
 
 
@@ -85,9 +81,6 @@ def parse_run(path: Path, given: UserInputs = UserInputs()) -> Capture:
     """Return the frames of a RUN/cameras.json, training photos first, in the unit of the scene; a run has no points.
 
     Photos are where the run found them, unless the user gives their folder.
-
-    Raises:
-        UserError: see `read_cameras`, or config.json beside the file cannot be read.
     """
     cameras = _read_frames(path, given=False)
     splits = (("train", cameras.train), ("test", cameras.test))

@@ -170,12 +170,7 @@ def _listed_bounds(content: dict[str, Any], path: Path) -> dict[str, tuple[float
 
 
 def parse_scene(root: Path, given: UserInputs = UserInputs()) -> Capture:
-    """Read the scene in a folder, with the photos of another folder if one is given.
-
-    Raises:
-        UserError: scene.json is missing, of another version, or malformed, and the key is named; or the model is
-            damaged.
-    """
+    """Read the scene in a folder, with the photos of another folder if one is given."""
     path = root / SCENE_FILE
     content = read_json_object(path)
     if content.get("measurement") == "transmission":
@@ -233,9 +228,6 @@ def write_scene(capture: Capture, folder: Path) -> None:
 
     Masks are listed one by one. A split in the capture is kept; otherwise every 8th photo is held out. The capture's
     provenance is recorded beside the command and the version.
-
-    Raises:
-        UserError: a frame has no photo, or the folder cannot be written.
     """
     image_folder, names = _named(capture)
     capture = replace(

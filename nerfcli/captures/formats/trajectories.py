@@ -55,13 +55,10 @@ def losses_kitti(capture: Capture) -> tuple[str, ...]:
 
 
 def write_tum(capture: Capture, path: Path) -> None:
-    """Write a capture's poses in the TUM format, atomically, with full precision.
+    """Write a capture's poses in the TUM format, with full precision.
 
     The timestamps are the frames' names where all of them are different numbers, without the suffix of a picture
     ("1305031102.175304.png"); else the frames' indices.
-
-    Raises:
-        UserError: the file cannot be written.
     """
     lines = ["# timestamp tx ty tz qx qy qz qw"]
     poses = np.stack([frame.world_from_cam for frame in capture.frames])
@@ -73,21 +70,13 @@ def write_tum(capture: Capture, path: Path) -> None:
 
 
 def write_kitti(capture: Capture, path: Path) -> None:
-    """Write a capture's poses in the KITTI format, atomically, with full precision.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
+    """Write a capture's poses in the KITTI format, with full precision."""
     rows = [frame.world_from_cam[:3].ravel().tolist() for frame in capture.frames]
     _write([" ".join(map(repr, row)) for row in rows], path)
 
 
 def _parsed(path: Path, given: UserInputs, read: Callable[[Path], Poses], *, kind: str) -> Capture:
-    """Read a trajectory, whose frames have the given camera, since the file has none, and their timestamps or numbers.
-
-    Raises:
-        UserError: the file is damaged (file and line are named), or no camera is given.
-    """
+    """Read a trajectory, whose frames have the given camera, since the file has none."""
     if given.camera is None:
         raise UserError(f"{path}: a {kind.upper()} trajectory contains poses but no camera", GIVE_CAMERA)
     poses, notes = read(path)
@@ -102,11 +91,7 @@ def timed_rows(path: Path, expected: str) -> list[Row]:
 
 
 def tum_poses(path: Path) -> Poses:
-    """Read the timestamps and poses `world_from_cam` of a trajectory in the TUM format, and notes of what was left out.
-
-    Raises:
-        UserError: the file is damaged; file and line are named.
-    """
+    """Read the timestamps and poses `world_from_cam` of a trajectory in the TUM format, and what was left out."""
     usable, poses = FramePoses(), []
     for cells, where in timed_rows(path, _TUM_EXPECTED):
         if len(cells) != 8:

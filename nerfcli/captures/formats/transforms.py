@@ -70,13 +70,10 @@ def losses_transforms(capture: Capture) -> tuple[str, ...]:
 
 
 def write_transforms(capture: Capture, path: Path) -> None:
-    """Write a capture as nerfstudio's transforms.json (OpenGL axes), atomically; instant-ngp reads it too.
+    """Write a capture as nerfstudio's transforms.json (OpenGL axes); instant-ngp reads it too.
 
     Intrinsics are written once if all frames share them. Paths of images and masks are relative to the file's folder;
     an image whose path is unknown gets its frame's name. Points are written beside the file, as NAME_points.ply.
-
-    Raises:
-        UserError: the file cannot be written.
     """
     intrinsics = {
         camera: record_of_camera(camera) for camera in dict.fromkeys(frame.camera for frame in capture.frames)
@@ -106,11 +103,7 @@ def write_transforms(capture: Capture, path: Path) -> None:
 
 
 def records_of(path: Path, content: dict[str, Any], key: str = "frames") -> list[tuple[dict[str, Any], str]]:
-    """Return the entries of a list of frames, with the keys of the whole file, and their places in it.
-
-    Raises:
-        UserError: there is no such list, or it is empty.
-    """
+    """Return the entries of a list of frames, with the keys of the whole file, and their places in it."""
     records = content.get(key)
     if not isinstance(records, list) or not records or not all(isinstance(item, dict) for item in records):
         raise malformed(
@@ -255,11 +248,7 @@ def _listed_path(record: dict[str, Any], where: str) -> str:
 
 
 def _points_beside(path: Path, content: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
-    """Read points (N, 3) and colours (N, 3) of the PLY file that ply_file_path names; no points if it is not given.
-
-    Returns:
-        The points, their colours, and a note if there is no such file.
-    """
+    """Read points (N, 3) and colours (N, 3) of the PLY file that ply_file_path names, and a note if it is not there."""
     cloud = content.get("ply_file_path")
     if cloud is None or cloud == "":
         return np.zeros((0, 3)), None, ()

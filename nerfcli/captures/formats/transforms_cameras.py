@@ -52,9 +52,6 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
         record: the frame's keys, merged over those of the whole file.
         size: of the picture that the numbers are for.
         fits: takes a note where the terms are fitted by others.
-
-    Raises:
-        UserError: no focal length, an invalid number, or an unknown lens model.
     """
     width, height = size
     model = record.get("camera_model")
@@ -148,11 +145,7 @@ def lost_to_transforms(camera: Camera) -> list[str]:
 
 
 def given_size(record: dict[str, Any], where: str) -> tuple[int, int] | None:
-    """Return the width and height under `w` and `h`, or None if one of them is missing.
-
-    Raises:
-        UserError: they are not whole numbers of pixels.
-    """
+    """Return the width and height under `w` and `h`, or None if one of them is missing."""
     width, height = number(record, "w", where), number(record, "h", where)
     if width is None or height is None:
         return None
@@ -164,11 +157,7 @@ def given_size(record: dict[str, Any], where: str) -> tuple[int, int] | None:
 
 
 def number(record: dict[str, Any], key: str, where: str) -> float | None:
-    """Return the number under a key, or None if there is none: no key, null, or the empty text of a template.
-
-    Raises:
-        UserError: the value is not a finite number.
-    """
+    """Return the number under a key, or None if there is none: no key, null, or the empty text of a template."""
     return None if record.get(key) in (None, "") else fields.number(record, key, where)
 
 
