@@ -85,12 +85,7 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def _checked(path: Path, entries: list[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:
-    """Return the files of an archive that is safe to unpack, without those that systems add.
-
-    Raises:
-        UserError: a name leads out of the folder or is used twice, or is of a link, a file is encrypted, or the files
-            are too many or too large.
-    """
+    """Return the files of an archive, without those that systems add, or refuse one that is not safe to unpack."""
     hint = "unpack it yourself if you trust its source, and give the folder"
     members: dict[str, zipfile.ZipInfo] = {}
     for entry in entries:
@@ -127,11 +122,7 @@ def _digest(members: list[zipfile.ZipInfo]) -> str:
 
 
 def _is_kept(folder: Path, content: dict[str, Any], path: Path, *, overwrite: bool) -> bool:
-    """Return whether a folder has the files of an archive already.
-
-    Raises:
-        UserError: it has something else, and must not be replaced.
-    """
+    """Return whether a folder has the files of an archive already; refuse one that must not be replaced."""
     if not folder.exists():
         return False
     record = folder / ARCHIVE_FILE

@@ -252,11 +252,7 @@ def _convention(form: Format, wanted: TargetOptions) -> Convention:
 
 
 def _checked(capture: Capture, path: Path, form: Format, convention: Convention) -> tuple[Check, float]:
-    """Compare the written file with the capture; return also the largest shift of a pixel by lost lens terms.
-
-    Raises:
-        UserError: with exit code 7, the file cannot be read back, or does not hold the capture.
-    """
+    """Compare the written file with the capture; return also the largest shift of a pixel by lost lens terms."""
     assert form.losses is not None
     ideal = {frame.camera: Camera.pinhole(*frame.camera.size, frame.camera.width) for frame in capture.frames}
     without_lenses = replace(capture, frames=tuple(replace(f, camera=ideal[f.camera]) for f in capture.frames))

@@ -139,11 +139,7 @@ def _upright(capture: Capture, frame: Frame) -> Frame:
 
 
 def refuse_without_training_photos(scene: Capture) -> None:
-    """Refuse a scene that holds out every photo.
-
-    Raises:
-        UserError: no training photo is left.
-    """
+    """Refuse a scene that holds out every photo."""
     if not scene.train_frames:
         hint = "its split lists none: choose another with --holdout, such as every:8"
         if len(scene.frames) < 2:
@@ -152,11 +148,7 @@ def refuse_without_training_photos(scene: Capture) -> None:
 
 
 def refuse_without_held_out_photos(scene: Capture) -> None:
-    """Refuse a scene whose split holds out no photo.
-
-    Raises:
-        UserError: there is no held-out photo.
-    """
+    """Refuse a scene whose split holds out no photo."""
     if not scene.test_frames:
         # Of all other formats, a split that lists none is no split.
         hint = (

@@ -80,10 +80,6 @@ def read_mask(path: Path, photo: Path) -> np.ndarray:
 
 
 def write_masks(folder: Path, masks: Mapping[str, np.ndarray]) -> None:
-    """Write FOLDER/PHOTO.png for masks (height, width) bool by the name of the photo: white is used, black ignored.
-
-    Raises:
-        UserError: they cannot be written.
-    """
+    """Write FOLDER/PHOTO.png for masks (height, width) bool by the name of the photo: white is used, black ignored."""
     for name, mask in masks.items():
         write_png(folder / f"{name}.png", np.where(mask, 255, 0).astype(np.uint8))

@@ -184,11 +184,7 @@ def _first_frame(path: Path, stream: str, filters: str) -> "tuple[np.ndarray | N
 
 
 def _largest_stream(path: Path, head: Sequence[str]) -> tuple[int, str, int]:
-    """Return the number of the video stream with most pixels, ffmpeg's line on it, and the number of such streams.
-
-    Raises:
-        UserError: several are equally large, such as those of two lenses.
-    """
+    """Return the number of the one video stream with most pixels, ffmpeg's line on it, and how many there are."""
     inputs = takewhile(lambda line: "Output #0" not in line, head)
     found = [(line, match) for line in inputs if (match := _STREAM.search(line)) and not _COVER.search(line)]
     if not found:

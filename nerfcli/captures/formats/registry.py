@@ -125,11 +125,7 @@ def _captures_in(path: Path) -> list[Path]:
 
 
 def refuse_archive(path: Path) -> None:
-    """Refuse an archive where it cannot be unpacked, since no result is asked for.
-
-    Raises:
-        UserError: it is one.
-    """
+    """Refuse an archive where it cannot be unpacked, since no result is asked for."""
     if path.is_file() and path.suffix.lower() in ARCHIVES:
         raise UserError(f"{path} is an archive", f"unpack it: nerfcli convert {in_shell(path)} SCENE --to nerfcli")
 
@@ -140,11 +136,7 @@ def photo_folder(path: Path) -> Path | None:
 
 
 def format_named(name: str) -> Format:
-    """Return the format with this name.
-
-    Raises:
-        UserError: there is none.
-    """
+    """Return the format with this name, or raise a `UserError` that lists all names."""
     for form in FORMATS:
         if form.name == name:
             return form
