@@ -246,6 +246,11 @@ class Camera:
         """Return the same lens with its principal point at (x, y) pixels; a spherical picture has none and is kept."""
         return self.with_values({"cx": x, "cy": y})
 
+    def shifted(self, x: float, y: float) -> "Camera":
+        """Return the camera with its principal point moved by (x, y) pixels."""
+        cx, cy = self.principal_point
+        return self.with_principal_point(cx + x, cy + y)
+
     def with_values(self, values: Mapping[str, float]) -> "Camera":
         """Return the camera with other values of some parameters; names that its model does not have are ignored."""
         return replace(self, params=tuple(values.get(name, value) for name, value in self.values.items()))

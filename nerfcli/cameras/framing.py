@@ -45,7 +45,7 @@ def sized(camera: Camera, width: int | None, height: int | None) -> Camera:
     names = ("f", "fx", "fy", "cx", "cy")
     scaled = camera.with_values({name: scale * value for name, value in camera.values.items() if name in names})
     covering = replace(scaled, width=width, height=height)
-    return _shifted(covering, (width - scale * camera.width) / 2, (height - scale * camera.height) / 2)
+    return covering.shifted((width - scale * camera.width) / 2, (height - scale * camera.height) / 2)
 
 
 def cropped(camera: Camera, window: Window) -> Camera:
@@ -65,7 +65,7 @@ def cropped(camera: Camera, window: Window) -> Camera:
             "give X,Y,WIDTH,HEIGHT in pixels from the top-left corner, after --width and --height are applied",
             exit_code=2,
         )
-    return _shifted(replace(camera, width=window.width, height=window.height), -window.x, -window.y)
+    return replace(camera, width=window.width, height=window.height).shifted(-window.x, -window.y)
 
 
 def with_lens(camera: Camera, lens: str, fov_deg: float | None) -> Camera:
@@ -118,9 +118,3 @@ def equirectangular(width: int, height: int) -> Camera:
             exit_code=2,
         )
     return Camera("EQUIRECTANGULAR", width, height, (width, height))
-
-
-def _shifted(camera: Camera, x: float, y: float) -> Camera:
-    """Return the camera with its principal point moved, for a picture that was cropped at its left or top edge."""
-    cx, cy = camera.principal_point
-    return camera.with_principal_point(cx + x, cy + y)

@@ -4,7 +4,7 @@ Axes are written as three letters for the directions in which the camera's +x, +
 d(own) or u(p), f(orward) or b(ackward). OpenCV's are rdf. Some have names.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import permutations, product
@@ -98,11 +98,8 @@ def reinterpreted(capture: Capture, true_convention: Convention, *, parsed_axes:
     """
     poses = reinterpreted_poses(poses_of(capture), true_convention, parsed_axes=parsed_axes)
     shift = 0.5 - true_convention.pixel_centre
-    cameras = {
-        camera: for_picture(shifted(camera, shift), true_convention.intrinsics_scale)
-        for camera in {frame.camera for frame in capture.frames}
-    }
-    return _with_views(capture, poses, cameras, shift)
+    scale = true_convention.intrinsics_scale
+    return _with_views(capture, poses, lambda camera: for_picture(camera.shifted(shift, shift), scale), shift)
 
 
 def expressed(capture: Capture, wanted: Convention, *, written_axes: str) -> Capture:
@@ -112,8 +109,7 @@ def expressed(capture: Capture, wanted: Convention, *, written_axes: str) -> Cap
     """
     turn = opencv_from_axes(wanted.axes) @ rigid.inverse(opencv_from_axes(written_axes))
     shift = wanted.pixel_centre - 0.5
-    cameras = {camera: shifted(camera, shift) for camera in {frame.camera for frame in capture.frames}}
-    return _with_views(capture, poses_of(capture) @ turn, cameras, shift)
+    return _with_views(capture, poses_of(capture) @ turn, lambda camera: camera.shifted(shift, shift), shift)
 
 
 def reinterpreted_poses(world_from_cam: np.ndarray, true_convention: Convention, *, parsed_axes: str) -> np.ndarray:
@@ -139,15 +135,8 @@ def for_picture(camera: Camera, intrinsics_scale: float) -> Camera:
     return camera.with_values({n: value / intrinsics_scale for n, value in camera.values.items() if n in scaled})
 
 
-def shifted(camera: Camera, shift_px: float) -> Camera:
-    """Return the camera with its principal point moved by the same number of pixels in x and y."""
-    if shift_px == 0 or camera.is_spherical:
-        return camera
-    cx, cy = camera.principal_point
-    return camera.with_principal_point(cx + shift_px, cy + shift_px)
-
-
-def _with_views(capture: Capture, poses: np.ndarray, cameras: dict[Camera, Camera], shift: float) -> Capture:
+def _with_views(capture: Capture, poses: np.ndarray, changed: Callable[[Camera], Camera], shift: float) -> Capture:
+    cameras = {camera: changed(camera) for camera in {frame.camera for frame in capture.frames}}
     frames = tuple(
         replace(frame, camera=cameras[frame.camera], world_from_cam=pose)
         for frame, pose in zip(capture.frames, poses, strict=True)

@@ -13,7 +13,7 @@ import numpy as np
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.captures.axes import Convention, for_picture, shifted
+from nerfcli.captures.axes import Convention, for_picture
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import UserError
 from nerfcli.matching.agreement import agreement, fundamental_matrix, rays_of
@@ -228,9 +228,9 @@ def _directions(
     cameras: Sequence[Camera], frame_index: np.ndarray, pixels: np.ndarray, convention: Convention
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the unit viewing directions (M, 3) of pixels of frames, NaN without one, and pixels per radian (M,)."""
+    shift = 0.5 - convention.pixel_centre
     corrected = {
-        camera: for_picture(shifted(camera, 0.5 - convention.pixel_centre), convention.intrinsics_scale)
-        for camera in set(cameras)
+        camera: for_picture(camera.shifted(shift, shift), convention.intrinsics_scale) for camera in set(cameras)
     }
     focal_px = np.array([corrected[camera].focal_px for camera in cameras])
     return rays_of([corrected[camera] for camera in cameras], frame_index, pixels), focal_px[frame_index]
