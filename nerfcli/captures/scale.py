@@ -119,14 +119,13 @@ def known_distance(text: str, frames: Sequence[Frame]) -> KnownDistance:
     """
     try:
         first, second, length = shlex.split(text)
-        metres, *tolerance = (float(part) for part in length.replace("±", "+-").split("+-"))
+        length, stated, tolerance = length.replace("±", "+-").partition("+-")
+        metres, standard_error = float(length), float(tolerance) if stated else None
     except ValueError as error:
         raise UserError(f"{text!r} is not a valid distance", EXPECTED, exit_code=2) from error
-    if len(tolerance) > 1:
-        raise UserError(f"{text!r} is not a valid distance", EXPECTED, exit_code=2)
     a, b = (_place(place, frames) for place in (first, second))
     units = float(np.linalg.norm(a - b))
-    return KnownDistance(f"{first} to {second}", units, metres, tolerance[0] if tolerance else None)
+    return KnownDistance(f"{first} to {second}", units, metres, standard_error)
 
 
 def scale_from_distances(distances: Sequence[KnownDistance]) -> ScaleEstimate:
