@@ -131,10 +131,8 @@ def find_nerfies(path: Path) -> Path | None:
     """Find the folder that holds camera/ and rgb/ or dataset.json, given it or a file in it."""
     folder = path.parent.parent if path.parent.name == CAMERAS else path
     folder = path.parent if path.is_file() and path.name == DATASET else folder
-    if not any((folder / CAMERAS).glob("*.json")):
-        return None
-    first = next((folder / CAMERAS).glob("*.json"))
-    return folder if has_keys(first, b'"orientation"', lambda content: "position" in content) else None
+    first = next((folder / CAMERAS).glob("*.json"), None)
+    return folder if first and has_keys(first, b'"orientation"', lambda content: "position" in content) else None
 
 
 FORMAT = Format(

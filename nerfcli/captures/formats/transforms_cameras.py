@@ -61,17 +61,13 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
     foreign = next((key for key in _FOREIGN if record.get(key) not in (None, False)), None)
     if foreign is not None:
         raise malformed(where, f"the lens model of {foreign} is not supported", "undistort the pictures first")
-    fx = _focal(record, "x", width, where)
-    fy = _focal(record, "y", height, where)
-    if fx is None and fy is None:
+    focal = [_focal(record, "x", width, where), _focal(record, "y", height, where)]
+    known = [value for value in focal if value is not None]
+    if not known:
         raise malformed(where, "neither fl_x nor camera_angle_x is given", "expected the focal length or field of view")
-    fx = fx if fx is not None else fy
-    # Blender's files give only the horizontal angle, since pixels are square.
-    fy = fy if fy is not None else fx
-    assert fx is not None
-    assert fy is not None
     cx, cy = number(record, "cx", where), number(record, "cy", where)
-    head = (fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+    # Blender's files give only the horizontal angle, since pixels are square.
+    head = (known[0], known[-1], width / 2 if cx is None else cx, height / 2 if cy is None else cy)
     k1, k2, k3, k4, k5, k6, p1, p2 = (number(record, key, where) or 0.0 for key in _INTRINSICS)
     if (k5 or k6) and model != _RATIONAL:
         raise malformed(where, f"k5 is {k5:g} and k6 is {k6:g}", f"only camera_model {_RATIONAL} has these terms")
