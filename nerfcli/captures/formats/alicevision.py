@@ -44,8 +44,7 @@ _RADIAL = {"pinhole": 0, "none": 0, "radial1": 1, "radialk1": 1, "radial3": 3, "
 _FISHEYE = ("fisheye4", "fisheye")
 
 
-def is_alicevision(content: dict[str, Any]) -> bool:
-    """Return whether a JSON object has the keys of a reconstruction of AliceVision."""
+def _is_alicevision(content: dict[str, Any]) -> bool:
     return all(isinstance(content.get(key), list) for key in ("version", "views", "intrinsics", "poses"))
 
 
@@ -55,7 +54,7 @@ def parse_alicevision(path: Path, given: UserInputs = UserInputs()) -> Capture:
     Photos are where the file says, or, as it usually comes from another machine, in the given folder or beside it.
     """
     content = read_json_object(path)
-    if not is_alicevision(content):
+    if not _is_alicevision(content):
         raise malformed(str(path), "has no version, views, intrinsics or poses", _EXPECTED)
     version = tuple(int(number) for number in _numbers(content["version"], 3, f"{path}: version"))
     cameras = {
@@ -181,7 +180,7 @@ def find_alicevision(path: Path) -> Path | None:
     """Find a file .sfm, or a .json that is a reconstruction of AliceVision."""
     found = by_suffix(".sfm", *FILES)(path)
     if found is None and path.is_file() and path.suffix.lower() == ".json":
-        return path if has_keys(path, b'"featuresFolders"', is_alicevision) else None
+        return path if has_keys(path, b'"featuresFolders"', _is_alicevision) else None
     return found
 
 

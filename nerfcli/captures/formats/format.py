@@ -105,11 +105,11 @@ def folder_with(*names: str) -> Callable[[Path], Path | None]:
 
 def only_file(folder: Path, pattern: str, begins: str) -> Path | None:
     """Return the file in a folder that matches a pattern and begins with a text, if there is only one."""
-    found = [path for path in sorted(folder.glob(pattern)) if path.is_file() and begins_with(path, begins)]
+    found = [path for path in sorted(folder.glob(pattern)) if path.is_file() and _begins_with(path, begins)]
     return found[0] if len(found) == 1 else None
 
 
-def begins_with(path: Path, text: str) -> bool:
+def _begins_with(path: Path, text: str) -> bool:
     with opened(path) as stream:
         return stream.read(len(text)) == text
 

@@ -133,7 +133,11 @@ class FramePoses:
     def read_quaternion(
         self, name: str, where: str, values: Callable[[], Sequence[float] | np.ndarray]
     ) -> np.ndarray | None:
-        """Return the pose (4, 4) of a frame from the quaternion xyzw and the position in the file; None if unusable."""
+        """Return the pose (4, 4) of a frame from the quaternion xyzw and the position in the file; None if unusable.
+
+        Raises:
+            UserError: the quaternion's length differs from 1 by more than rounding explains.
+        """
         self._count += 1
         try:
             pose = np.array(values())  # (7,)
@@ -142,7 +146,10 @@ class FramePoses:
         except NotFiniteError as error:
             self._lost.append((name, error))
             return None
-        return quaternion_pose(pose[:4], pose[4:], where)
+        length = np.linalg.norm(pose[:4])
+        if abs(length - 1.0) > _MAX_DEVIATION:
+            raise UserError(f"{where}: its quaternion has length {length:.4g}", "expected length 1")
+        return rigid.from_parts(rigid.rotation_from_quaternion(pose[[3, 0, 1, 2]]), pose[4:])
 
     def notes(self) -> tuple[str, ...]:
         """Return what was left out and normalised, for people.
@@ -208,18 +215,6 @@ def left_out(lost: Sequence[tuple[str, UserError]], count: int) -> tuple[str, ..
 def without(names: Sequence[str], what: str) -> tuple[str, ...]:
     """Return a line on the photos that are left out, as they are without a pose or the like; none if there are none."""
     return (f"{several(len(names), 'photo')} without {what} left out: {listed(names)}",) if names else ()
-
-
-def quaternion_pose(xyzw: np.ndarray, position: np.ndarray, where: str) -> np.ndarray:
-    """Return the pose (4, 4) of a quaternion (4,) in the order x, y, z, w and a position (3,).
-
-    Raises:
-        UserError: the quaternion's length differs from 1 by more than rounding explains.
-    """
-    length = np.linalg.norm(xyzw)
-    if abs(length - 1.0) > _MAX_DEVIATION:
-        raise UserError(f"{where}: its quaternion has length {length:.4g}", "expected length 1")
-    return rigid.from_parts(rigid.rotation_from_quaternion(xyzw[[3, 0, 1, 2]]), position)
 
 
 def _bend(rotation: np.ndarray) -> float:

@@ -45,6 +45,7 @@ _INTRINSICS = (
     *("intrinsics.txt", "camera-intrinsics.txt", "camera_intrinsics.txt", "intrinsic.txt"),
 )
 _EXPECTED = "expected a 4x4 matrix, world from camera"
+_LENGTHS = (12, 16)  # a pose has 3 or 4 rows
 _SPLITS = {"0_": "train", "1_": "val", "2_": "test"}
 
 
@@ -55,12 +56,6 @@ def pose_files(folder: Path) -> list[Path]:
     """
     found = next(filter(None, (list((folder / name).glob("*.txt")) for name in POSE_FOLDERS)), None)
     return sorted(found or folder.glob("*.pose.txt"), key=lambda file: (len(file.name), file.name))
-
-
-def is_pose(path: Path) -> bool:
-    """Return whether a text file has as many numbers as a pose."""
-    with opened(path) as stream:
-        return len(stream.read(10_000).split()) in (12, 16)
 
 
 def parse_pose_files(folder: Path, given: UserInputs = UserInputs()) -> Capture:
@@ -100,7 +95,7 @@ def _photos(stems: list[str], homes: tuple[Path, ...], images: Path | None) -> F
 def _matrix(file: Path) -> np.ndarray:
     """Return the matrix in a file, (3, 4) or (4, 4)."""
     fields = read_text(file, _EXPECTED).split()
-    if len(fields) not in (12, 16):
+    if len(fields) not in _LENGTHS:
         raise malformed(str(file), f"has {len(fields)} numbers", _EXPECTED)
     return np.array(numbers(fields, len(fields), str(file))).reshape(-1, 4)
 
@@ -137,7 +132,10 @@ def find_pose_files(path: Path) -> Path | None:
     """Find a folder with a text file for each pose, or the one that the folder of these files is in."""
     folder = path.parent if path.name in POSE_FOLDERS else path
     files = pose_files(folder) if folder.is_dir() else []
-    return folder if files and is_pose(files[0]) else None
+    if not files:
+        return None
+    with opened(files[0]) as stream:
+        return folder if len(stream.read(10_000).split()) in _LENGTHS else None
 
 
 FORMAT = Format(

@@ -35,11 +35,6 @@ IMAGE_FOLDERS = ("rgb", "rgbd", "images")
 _POSES, _INTRINSICS = "poses", "perFrameIntrinsicCoeffs"
 
 
-def is_record3d(content: dict[str, Any]) -> bool:
-    """Return whether a JSON object has the keys of a capture by Record3D."""
-    return all(key in content for key in (_POSES, "K", "w", "h"))
-
-
 def parse_record3d(path: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the frames of a capture; the unit is the metre, by LiDAR or ARKit."""
     content = read_json_object(path)
@@ -82,7 +77,8 @@ def _intrinsics(content: dict[str, Any], count: int, where: str) -> np.ndarray:
 def find_record3d(path: Path) -> Path | None:
     """Find the file metadata.json, or metadata, of a capture by Record3D."""
     found = path if path.is_file() and path.name in FILES else named(*FILES)(path)
-    return found if found is not None and has_keys(found, b'"poses"', is_record3d) else None
+    keys = {_POSES, "K", "w", "h"}
+    return found if found and has_keys(found, b'"poses"', lambda content: keys <= set(content)) else None
 
 
 FORMAT = Format(
