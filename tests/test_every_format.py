@@ -50,7 +50,7 @@ def test_a_capture_with_photos_is_trained_on(name, tmp_path):
     place = file if name == "run" else tmp_path  # a folder of a run is taken for a mistake
     scene = load_scene(place)
     kind = name.removesuffix("-text")
-    assert (scene.kind, scene.missing, len(scene.frames)) == (kind, (), 3)
+    assert (scene.kind, scene.missing, scene.notes, len(scene.frames)) == (kind, (), (), 3)
     assert scene.unit == ("metre" if name in METRIC else "arbitrary")
     assert len(scene.test_frames) == 1
     for frame in scene.frames:

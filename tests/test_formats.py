@@ -11,7 +11,7 @@ from PIL import Image
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.captures.axes import opencv_pose, pose_in_axes
+from nerfcli.captures.axes import pose_in_axes
 from nerfcli.captures.formats.colmap import is_model, read_model
 from nerfcli.captures.formats.transforms import parse_transforms
 from nerfcli.captures.loading import load_scene
@@ -43,12 +43,6 @@ def write_capture(folder: Path, content: dict[str, Any], *, name: str = "transfo
 
 def entry(file_path: str, **more: Any) -> dict[str, Any]:
     return {"file_path": file_path, "transform_matrix": OPENGL_POSE, **more}
-
-
-def test_axes_of_other_programs_by_hand():
-    for axes, pose in (("opengl", OPENGL_POSE), ("llff", LLFF_POSE)):
-        np.testing.assert_array_equal(opencv_pose(np.array(pose), axes), OPENCV_POSE)
-        np.testing.assert_array_equal(pose_in_axes(np.array(OPENCV_POSE), axes), pose)
 
 
 def test_instant_ngp_file_with_shared_intrinsics_and_missing_images(tmp_path):

@@ -48,20 +48,6 @@ def pixels(capture: Capture, points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_camera_sees_the_point_that_it_looks_at_in_its_principal_point(tmp_path, name):
-    """And a point to the right of it, 0.5 at distance 5, to the right by a tenth of the focal length; up is up."""
-    WITH_PHOTOS[name](VIEWS, tmp_path)
-    right = np.array([0.8, 0.6, 0.0]) / 2  # of the first camera, which looks along (-3, 4, 0)
-    up = np.array([0.0, 0.0, 0.5])
-    capture = parse(tmp_path)
-    assert (capture.kind, len(capture.frames), capture.missing, capture.notes) == (name, 2, (), ())
-    first = next(frame for frame in capture.frames if np.allclose(frame.centre, PLACES[0], rtol=0, atol=1e-12))
-    capture = Capture((first,), np.zeros((0, 3)))
-    moved = pixels(capture, np.stack([np.zeros(3), right, up])) - CENTRE
-    np.testing.assert_allclose(moved, [[0, 0], [FOCAL / 10, 0], [0, -FOCAL / 10]], rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", NAMES)
 def test_files_of_windows_with_a_byte_order_mark_are_read(tmp_path, name):
     WITH_PHOTOS[name](VIEWS, tmp_path)
     for path in tmp_path.rglob("*"):
