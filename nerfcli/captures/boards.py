@@ -276,6 +276,7 @@ def scale_from_markers(frames: Sequence[Frame], side: float, *, dictionary: str)
     In a given photo, a marker is not used if it appears twice or its edges are not visible.
 
     Args:
+        frames: with cameras that fit the photos on disk, see `orientation.upright`.
         side: length of the black square's side in metres.
         dictionary: OpenCV's name, such as DICT_4X4_50.
 
@@ -346,15 +347,7 @@ def _dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 def _photos(frames: Sequence[Frame]) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the index and grey picture (H, W) uint8 of each frame with a photo."""
+    """Yield the index and grey picture (H, W) uint8 of each frame, whose camera is for the photo as it is on disk."""
     for index, frame in enumerate(frames):
-        if frame.image is None:
-            continue
-        picture = read_image(frame.image)
-        if picture.shape[:2] != (frame.camera.height, frame.camera.width):
-            raise UserError(
-                f"{frame.image} is {picture.shape[1]}x{picture.shape[0]} pixels, but its camera is for "
-                f"{frame.camera.width}x{frame.camera.height}",
-                "give the photos that belong to these cameras",
-            )
-        yield index, cv2.cvtColor(np.ascontiguousarray(picture[..., :3]), cv2.COLOR_RGB2GRAY)
+        assert frame.image is not None
+        yield index, cv2.cvtColor(np.ascontiguousarray(read_image(frame.image)[..., :3]), cv2.COLOR_RGB2GRAY)
