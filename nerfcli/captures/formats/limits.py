@@ -39,7 +39,7 @@ def checked_camera(model: str, width: int, height: int, params: tuple[float, ...
     """
     if max(width, height) > MOST_PIXELS:
         raise UserError(
-            f"{where}: invalid size of a picture: {_short(width)}x{_short(height)} pixels",
+            f"{where}: invalid size of a picture: {width:.12g}x{height:.12g} pixels",
             f"width and height must be at most {MOST_PIXELS}",
         )
     if not all(abs(value) < MOST_PARAMETER for value in params):  # True at NaN
@@ -56,10 +56,6 @@ def checked_camera(model: str, width: int, height: int, params: tuple[float, ...
         return Camera(model, width, height, params)
     except UserError as error:
         raise UserError(f"{where}: {error.message}", error.hint) from error
-
-
-def _short(number: int) -> str:
-    return str(number) if number < 10**12 else f"{float(number):.3g}" if number < 10**300 else "1e300 or more"
 
 
 def rigid_pose(matrix: np.ndarray, where: str) -> np.ndarray:
