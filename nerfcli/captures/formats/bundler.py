@@ -55,9 +55,9 @@ def parse_bundler(path: Path, given: UserInputs = UserInputs()) -> Capture:
         )
     registered = [index for index in range(num_cameras) if numbers(*_line(lines, 1 + 5 * index, 3, path))[0] != 0]
     unregistered = [names[index] for index in sorted({*range(num_cameras)} - {*registered})]
-    check_unique_names((names[index] for index in registered), image_list if registered else path)
-    found = find_photos([names[index] for index in registered], (image_list.parent,), given=given.images)
-    found = found.required(str(path), "the file does not give their sizes")
+    posed = [names[index] for index in registered]
+    check_unique_names(posed, image_list if registered else path)
+    found = find_photos(posed, (image_list.parent,), given=given.images).required(path)
     poses, frames, middles = FramePoses(), [], []
     index_of_camera = np.full(num_cameras, -1, dtype=np.int64)
     for index, name, image in zip(registered, found.names, found.paths, strict=True):

@@ -36,8 +36,7 @@ def parse_mvsnet(folder: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the cameras in cams/, with their depth bounds where all files have them."""
     files = sorted((folder / CAMERA_FOLDER).glob(CAMERA_FILES))
     stems = [file.name.removesuffix(CAMERA_FILES[1:]) for file in files]
-    photos = find_photos(stems, (folder,), given=given.images, folders=IMAGE_FOLDERS)
-    photos = photos.required(str(folder), "they give the names")
+    photos = find_photos(stems, (folder,), given=given.images, folders=IMAGE_FOLDERS).required(folder)
     fits, poses, frames, bounds = Fits(), FramePoses(), [], []
     for file, stem, image in zip(files, stems, photos.paths, strict=True):
         fields = _fields(file)

@@ -52,21 +52,14 @@ class FoundPhotos:
         """The names of photos that are not on disk."""
         return tuple(name for name, path in zip(self.listed, self.paths, strict=True) if path is None)
 
-    def required(self, where: str, gives: str) -> "FoundPhotos":
-        """Return these photos, for a format that cannot do without them.
-
-        Args:
-            gives: why: "they give the names".
-
-        Raises:
-            UserError: none is on disk; the message begins with `where`.
-        """
+    def required(self, capture: Path) -> "FoundPhotos":
+        """Return these photos, for a format that cannot do without them: some must be on disk."""
         if self.listed and not any(self.paths):
             raise malformed(
-                where,
+                str(capture),
                 f"none of the {len(self.listed)} listed photos exists in {self.folder}, such as "
                 f"{shown(self.listed[0])}",
-                f"the photos are needed, as {gives}; {GIVE_PHOTOS}",
+                f"the photos are needed for their names and sizes; {GIVE_PHOTOS}",
             )
         return self
 

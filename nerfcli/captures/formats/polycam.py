@@ -49,9 +49,7 @@ def parse_polycam(folder: Path, given: UserInputs = UserInputs()) -> Capture:
         stems.append(file.stem)
         views.append((camera, poses.read(file.stem, where, partial(_matrix, record, where))))
     sizes = [camera.size for camera, _ in views]
-    photos = find_photos(stems, (found[1],), given=given.images, sizes=sizes).required(
-        str(folder), "they give the names"
-    )
+    photos = find_photos(stems, (found[1],), given=given.images, sizes=sizes).required(folder)
     frames = []
     for stem, image, (camera, pose) in zip(stems, photos.paths, views, strict=True):
         if image is not None and pose is not None:

@@ -66,7 +66,7 @@ def parse_pose_files(folder: Path, given: UserInputs = UserInputs()) -> Capture:
     """
     files = pose_files(folder)
     stems = [file.name.removesuffix(".txt").removesuffix(".pose") for file in files]
-    photos = _photos(stems, (folder, files[0].parent), given.images).required(str(folder), "they give the names")
+    photos = _photos(stems, (folder, files[0].parent), given.images).required(folder)
     fits, poses, frames = Fits(), FramePoses(), []
     camera_of_size = _cameras(folder, given.camera, fits)
     names_give_splits = all(file.name[:2] in _SPLITS for file in files)

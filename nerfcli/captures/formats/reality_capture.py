@@ -63,9 +63,7 @@ def parse_reality_capture(path: Path, given: UserInputs = UserInputs()) -> Captu
     say which model it is.
     """
     names, rows, places, lost = _table(path)
-    found = find_photos(names, (path.parent,), given=given.images).required(
-        str(path), "the file does not give their sizes"
-    )
+    found = find_photos(names, (path.parent,), given=given.images).required(path)
     value = {key: rows[:, index] for index, key in enumerate(_NUMBERS)}
     angles = np.stack([-value["heading"], value["pitch"], value["roll"]], axis=-1)
     rotations = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
@@ -180,8 +178,7 @@ def parse_realityscan_xmp(folder: Path, given: UserInputs = UserInputs()) -> Cap
             (posed if has_pose else without).append((path, value))
     if not posed:
         raise malformed(str(folder), "its XMP files have no poses", "align the photos, and export XMP with poses")
-    found = find_photos([path.stem for path, _ in posed], [folder], given=given.images)
-    found = found.required(str(folder), "they give the sizes of the pictures")
+    found = find_photos([path.stem for path, _ in posed], [folder], given=given.images).required(folder)
     fits, poses, frames = Fits(), FramePoses(), []
     for (path, value), image in zip(posed, found.paths, strict=True):
         if image is not None:

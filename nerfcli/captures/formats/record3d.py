@@ -45,7 +45,7 @@ def parse_record3d(path: Path, given: UserInputs = UserInputs()) -> Capture:
         raise malformed(where, f"{_POSES} is {shown(poses)}", "expected a list of poses")
     stems, sizes = [str(index) for index in range(len(poses))], [size] * len(poses)
     photos = find_photos(stems, (path.parent,), given=given.images, folders=IMAGE_FOLDERS, sizes=sizes)
-    photos = photos.required(where, "they give the names")
+    photos = photos.required(path)
     usable, frames = FramePoses(), []
     intrinsics = _intrinsics(content, len(poses), where).tolist()
     for index, (pose, image) in enumerate(zip(poses, photos.paths, strict=True)):

@@ -34,8 +34,7 @@ def frame_files(folder: Path) -> list[Path]:
 def parse_scanner_app(folder: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the frames that have a photo; the unit is the metre, by ARKit."""
     files = frame_files(folder)
-    found = find_photos([path.stem for path in files], [folder], given=given.images)
-    found = found.required(str(folder), "they give the sizes of the pictures")
+    found = find_photos([path.stem for path in files], [folder], given=given.images).required(folder)
     fits, poses, frames = Fits(), FramePoses(), []
     for path, image in zip(files, found.paths, strict=True):
         if image is None:
