@@ -55,7 +55,7 @@ def parse_alicevision(path: Path, given: UserInputs = UserInputs()) -> Capture:
     """
     content = read_json_object(path)
     if not _is_alicevision(content):
-        raise malformed(str(path), "has no version, views, intrinsics or poses", _EXPECTED)
+        raise malformed(path, "has no version, views, intrinsics or poses", _EXPECTED)
     version = tuple(int(number) for number in _numbers(content["version"], 3, f"{path}: version"))
     cameras = {
         key: _camera(record, place, version)

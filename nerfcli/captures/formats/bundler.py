@@ -50,9 +50,7 @@ def parse_bundler(path: Path, given: UserInputs = UserInputs()) -> Capture:
     listed = enumerate(read_text(image_list, _LIST_EXPECTED).splitlines(), start=1)
     names = [_listed(line, f"{image_list}: line {number}") for number, line in listed if line.strip()]
     if len(names) != num_cameras:
-        raise malformed(
-            str(path), f"has {num_cameras} cameras, but {image_list} has {len(names)} images", _LIST_EXPECTED
-        )
+        raise malformed(path, f"has {num_cameras} cameras, but {image_list} has {len(names)} images", _LIST_EXPECTED)
     registered = [index for index in range(num_cameras) if numbers(*_line(lines, 1 + 5 * index, 3, path))[0] != 0]
     unregistered = [names[index] for index in sorted({*range(num_cameras)} - {*registered})]
     posed = [names[index] for index in registered]
@@ -85,7 +83,7 @@ def parse_bundler(path: Path, given: UserInputs = UserInputs()) -> Capture:
 def _lines(path: Path) -> list[Numbered]:
     text = read_text(path, _EXPECTED)
     if not text.startswith(BEGINS):
-        raise malformed(str(path), f"does not begin with {BEGINS}", _EXPECTED)
+        raise malformed(path, f"does not begin with {BEGINS}", _EXPECTED)
     if not text.startswith(_HEADER):
         raise malformed(f"{path}: line 1", "is of an unsupported version of the format", _EXPECTED)
     return content_lines(text)
@@ -109,7 +107,7 @@ def _counts(lines: list[Numbered], path: Path) -> tuple[int, int]:
 def _line(lines: list[Numbered], index: int, count: int, path: Path) -> tuple[list[str], int, str]:
     """Return the words of a line, their expected number and the line's place: the arguments of `numbers`."""
     if index >= len(lines):
-        raise malformed(str(path), "ends too early", "the file is cut off; copy it again")
+        raise malformed(path, "ends too early", "the file is cut off; copy it again")
     number, line = lines[index]
     return line.split(), count, f"{path}: line {number}"
 
@@ -121,7 +119,7 @@ def _find_list(path: Path) -> Path:
         if candidate.is_file():
             return candidate
     raise malformed(
-        str(path),
+        path,
         f"the list of images next to it is missing ({candidates[1]})",
         "write one: the names of the photos in the order of the cameras, one per line",
     )

@@ -76,7 +76,7 @@ def _bodies(path: Path) -> tuple[list[int], np.ndarray, tuple[str, ...]]:
             poses.append(pose)
     notes = usable.notes()
     if not times:
-        raise malformed(str(path), "has no pose", _EXPECTED)
+        raise malformed(path, "has no pose", _EXPECTED)
     return times, np.stack(poses), notes
 
 

@@ -33,7 +33,7 @@ _LONGEST_NAME = 1000
 _NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|1\.#)", re.IGNORECASE)
 
 
-def malformed(where: str, what: str, hint: str) -> UserError:
+def malformed(where: str | Path, what: str, hint: str) -> UserError:
     """Create the error for a field: its location, the value found, and the value expected."""
     return UserError(f"{where}: {what}", hint)
 
@@ -69,9 +69,9 @@ def read_text(path: Path, expected: str) -> str:
     try:
         return decoded(path.read_bytes())
     except OSError as error:
-        raise malformed(str(path), error.strerror or str(error), expected) from error
+        raise malformed(path, error.strerror or str(error), expected) from error
     except UnicodeDecodeError as error:
-        raise malformed(str(path), f"not UTF-8 text (byte {error.start})", expected) from error
+        raise malformed(path, f"not UTF-8 text (byte {error.start})", expected) from error
 
 
 def read_json(path: Path, expected: str) -> Any:
@@ -81,9 +81,9 @@ def read_json(path: Path, expected: str) -> Any:
         return json.loads(text)
     except json.JSONDecodeError as error:
         what = f"not valid JSON: {error.msg} in line {error.lineno}, column {error.colno}"
-        raise malformed(str(path), what, "the file is truncated or was edited by hand; write it again") from error
+        raise malformed(path, what, "the file is truncated or was edited by hand; write it again") from error
     except (ValueError, RecursionError) as error:  # a number with thousands of digits; too deep nesting
-        raise malformed(str(path), f"not valid JSON: {error}", expected) from error
+        raise malformed(path, f"not valid JSON: {error}", expected) from error
 
 
 def read_json_object(path: Path) -> dict[str, Any]:
@@ -99,10 +99,10 @@ def read_xml(path: Path, expected: str) -> ElementTree.Element:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise malformed(str(path), error.strerror or str(error), expected) from error
+        raise malformed(path, error.strerror or str(error), expected) from error
 
     def refuse(*_: object) -> NoReturn:
-        raise malformed(str(path), "declares a document type (DOCTYPE)", expected)
+        raise malformed(path, "declares a document type (DOCTYPE)", expected)
 
     builder = ElementTree.TreeBuilder()
     parser = expat.ParserCreate()
@@ -114,7 +114,7 @@ def read_xml(path: Path, expected: str) -> ElementTree.Element:
     try:
         parser.Parse(data, True)
     except (expat.ExpatError, ValueError, LookupError) as error:  # the latter two: an encoding that Python lacks
-        raise malformed(str(path), f"not valid XML: {error}", expected) from error
+        raise malformed(path, f"not valid XML: {error}", expected) from error
     return builder.close()
 
 
@@ -219,10 +219,10 @@ def check_unique_names(names: Iterable[str], path: Path) -> None:
     seen: set[str] = set()
     for name in names:
         if name in seen:
-            raise malformed(str(path), f"image {shown(name)} is listed twice", "remove one of its two entries")
+            raise malformed(path, f"image {shown(name)} is listed twice", "remove one of its two entries")
         seen.add(name)
     if not seen:
-        raise malformed(str(path), "lists no images with a pose", "the reconstruction is empty; run it again")
+        raise malformed(path, "lists no images with a pose", "the reconstruction is empty; run it again")
 
 
 def _no_value(record: dict[str, Any], key: str, where: str, hint: str) -> UserError:
@@ -285,7 +285,7 @@ def members_of_npz(path: Path) -> dict[str, bytes]:
         *(OSError, EOFError, ValueError, KeyError, IndexError, OverflowError, NotImplementedError, RuntimeError),
         *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error),
     ) as error:
-        raise malformed(str(path), f"is not a readable .npz file ({type(error).__name__}: {error})", DAMAGED) from error
+        raise malformed(path, f"is not a readable .npz file ({type(error).__name__}: {error})", DAMAGED) from error
 
 
 def array_of_npy(data: bytes) -> np.ndarray:

@@ -69,7 +69,7 @@ def parse_metashape(path: Path) -> Capture:
         camera, reason = next(iter(reasons.items()))
         first = f"{shown(camera.get('label'))} is {reason}"
         hint = "align or enable the photos, and export again"
-        raise malformed(str(path), f"lists no images with a pose: {first}", hint)
+        raise malformed(path, f"lists no images with a pose: {first}", hint)
     notes += [_left_out(reason, reasons) for reason in dict.fromkeys(reasons.values()) if reason]
     worlds = _worlds_from_chunk(chunk, path)
     components = [record.get("component_id") for record in records]
@@ -151,7 +151,7 @@ def _chunk(path: Path) -> tuple[Element, list[str]]:
     root = read_xml(path, _EXPECTED)
     chunks = [root] if root.tag == "chunk" else root.findall("chunk")
     if not chunks:
-        raise malformed(str(path), f"has no chunk element, but a {shown(root.tag)}", _EXPECTED)
+        raise malformed(path, f"has no chunk element, but a {shown(root.tag)}", _EXPECTED)
     names = [f"{number} ({chunk.get('label', '')})" for number, chunk in enumerate(chunks, start=1)]
     reasons = [list(_reasons(chunk).values()) for chunk in chunks]
     usable = [of_chunk.count("") for of_chunk in reasons]

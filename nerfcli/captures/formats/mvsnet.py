@@ -58,7 +58,7 @@ def _fields(file: Path) -> list[str]:
     """Return the words of a file: extrinsic, 16 numbers, intrinsic, 9 numbers, and up to 4 depths."""
     fields = read_text(file, _EXPECTED).split()
     if len(fields) < 27 or fields[0] != "extrinsic" or fields[17] != "intrinsic" or len(fields) > 31:
-        raise malformed(str(file), "is not a camera of MVSNet", _EXPECTED)
+        raise malformed(file, "is not a camera of MVSNet", _EXPECTED)
     return fields
 
 

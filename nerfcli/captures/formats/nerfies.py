@@ -65,7 +65,7 @@ def parse_nerfies(folder: Path, given: UserInputs = UserInputs()) -> Capture:
             place = place or homes[0] / name
             frames.append(Frame(place.name, camera, pose, image=place, split=splits.get(name)))
     if not frames:
-        raise malformed(str(folder), f"has no file in {CAMERAS}/ of the photos in {DATASET}", "copy the whole capture")
+        raise malformed(folder, f"has no file in {CAMERAS}/ of the photos in {DATASET}", "copy the whole capture")
     notes = (*found.notes, *poses.notes(), *without(unposed, "a camera"))
     bounds = _depth_bounds(folder / "scene.json", len(frames))
     return Capture(tuple(frames), _points(folder / "points.npy"), depth_bounds=bounds, kind="nerfies", notes=notes)
@@ -74,7 +74,7 @@ def parse_nerfies(folder: Path, given: UserInputs = UserInputs()) -> Capture:
 def _names(content: dict[str, Any], key: str, path: Path) -> list[str]:
     names = content.get(key, [])
     if not isinstance(names, list) or not all(isinstance(name, str | int) and "/" not in str(name) for name in names):
-        raise malformed(str(path), f"{key} is {shown(names)}", "expected a list of names")
+        raise malformed(path, f"{key} is {shown(names)}", "expected a list of names")
     return [str(name) for name in names]
 
 
@@ -121,9 +121,9 @@ def _points(path: Path) -> np.ndarray:
     try:
         points = array_of_npy(path.read_bytes())
     except ValueError as error:
-        raise malformed(str(path), str(error), DAMAGED) from error
+        raise malformed(path, str(error), DAMAGED) from error
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f" or not plausible(points).all():
-        raise malformed(str(path), f"has {points.shape} values of type {points.dtype}", "expected points (N, 3)")
+        raise malformed(path, f"has {points.shape} values of type {points.dtype}", "expected points (N, 3)")
     return points.astype(np.float64)
 
 

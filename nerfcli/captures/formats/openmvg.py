@@ -85,7 +85,7 @@ def _entries(content: dict[str, Any], key: str, home: Path | str) -> Iterator[tu
     """Yield key, value and place in the file of the entries of a list; `home` is the place that the list is in."""
     entries = content.get(key, [])
     if not isinstance(entries, list):
-        raise malformed(str(home), f"{key} is {shown(entries)}", "expected a list of keys and values")
+        raise malformed(home, f"{key} is {shown(entries)}", "expected a list of keys and values")
     for index, entry in enumerate(entries):
         where = f"{home}: {key}[{index}]"
         record = record_of(entry, where)
@@ -143,7 +143,7 @@ def _structure(content: dict[str, Any], frame_of: dict[int, int], path: Path) ->
                 pixels.append(vector(observation, "x", 2, place))
     positions = np.array(points).reshape(-1, 3)
     if not plausible(positions).all():
-        raise malformed(str(path), "a point of its structure is too far away", _EXPECTED)
+        raise malformed(path, "a point of its structure is too far away", _EXPECTED)
     if not seen:
         return positions, None
     table = np.array(seen, dtype=np.int64)

@@ -139,7 +139,7 @@ def _largest(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Return the reconstruction with most shots, and a note on the others."""
     content = read_json(path, _EXPECTED)
     if not isinstance(content, list) or not content:
-        raise malformed(str(path), f"holds {shown(content)}", _EXPECTED)
+        raise malformed(path, f"holds {shown(content)}", _EXPECTED)
     for index, item in enumerate(content):
         record_of(item, f"{path}: reconstruction {index}")
         shots = record_of(item.get("shots"), f"{path}: reconstruction {index}: shots")

@@ -56,7 +56,7 @@ class FoundPhotos:
         """Return these photos, for a format that cannot do without them: some must be on disk."""
         if self.listed and not any(self.paths):
             raise malformed(
-                str(capture),
+                capture,
                 f"none of the {len(self.listed)} listed photos exists in {self.folder}, such as "
                 f"{shown(self.listed[0])}",
                 f"the photos are needed for their names and sizes; {GIVE_PHOTOS}",

@@ -96,7 +96,7 @@ def _matrix(file: Path) -> np.ndarray:
     """Return the matrix in a file, (3, 4) or (4, 4)."""
     fields = read_text(file, _EXPECTED).split()
     if len(fields) not in _LENGTHS:
-        raise malformed(str(file), f"has {len(fields)} numbers", _EXPECTED)
+        raise malformed(file, f"has {len(fields)} numbers", _EXPECTED)
     return np.array(numbers(fields, len(fields), str(file))).reshape(-1, 4)
 
 
@@ -117,7 +117,7 @@ def _cameras(folder: Path, camera: Camera | None, fits: Fits) -> Callable[[tuple
         return lambda size: fits.matrix(matrix, size, str(path))
     if len(rows) < 2 or lengths[0] != 4 or lengths[-1] != 2:
         raise malformed(
-            str(path),
+            path,
             f"has lines of {', '.join(map(str, lengths[:6]))} numbers" if lengths else "is empty",
             'expected a 3x3 or 4x4 matrix, or first a line "f cx cy 0" and last "height width"',
         )

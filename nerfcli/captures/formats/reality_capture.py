@@ -86,7 +86,7 @@ def _table(path: Path) -> tuple[list[str], np.ndarray, list[str], tuple[str, ...
     lines = read_text(path, _EXPECTED).splitlines()
     start = next((index for index, line in enumerate(lines) if line.lower().startswith(("#name,", "name,"))), None)
     if start is None:
-        raise malformed(str(path), "has no header line #name,x,y,alt,...", _EXPECTED)
+        raise malformed(path, "has no header line #name,x,y,alt,...", _EXPECTED)
     header = [word.strip().lower() for word in lines[start].lstrip("#").split(",")]
     columns = {}
     for key, spellings in _COLUMNS.items():
@@ -177,7 +177,7 @@ def parse_realityscan_xmp(folder: Path, given: UserInputs = UserInputs()) -> Cap
             has_pose = {"Rotation", "Position"} <= set(value) and value.get("Coordinates") not in ("relative", "rigid")
             (posed if has_pose else without).append((path, value))
     if not posed:
-        raise malformed(str(folder), "its XMP files have no poses", "align the photos, and export XMP with poses")
+        raise malformed(folder, "its XMP files have no poses", "align the photos, and export XMP with poses")
     found = find_photos([path.stem for path, _ in posed], [folder], given=given.images).required(folder)
     fits, poses, frames = Fits(), FramePoses(), []
     for (path, value), image in zip(posed, found.paths, strict=True):

@@ -36,7 +36,7 @@ def parse_scannetpp(path: Path, given: UserInputs = UserInputs()) -> Capture:
     ]
     good = [(record, where) for record, where, _ in both if record.get("is_bad") is not True]
     if not good:
-        raise malformed(str(path), "marks all photos as bad", "copy the scene again")
+        raise malformed(path, "marks all photos as bad", "copy the scene again")
     frames, missing, notes = listed_frames(path, content, good, images=given.images, home=home, folders=folders)
     check_unique_names((frame.name for frame in frames), path)
     split_of = {plain_name(str(record.get("file_path"))): split for record, _, split in both}

@@ -46,7 +46,7 @@ def parse_stray_scanner(folder: Path, given: UserInputs = UserInputs()) -> Captu
         size = video.width, video.height
     else:
         raise malformed(
-            str(folder), f"has neither photos nor the video {_VIDEOS[0]}", f"copy the whole capture; {GIVE_PHOTOS}"
+            folder, f"has neither photos nor the video {_VIDEOS[0]}", f"copy the whole capture; {GIVE_PHOTOS}"
         )
     has_lenses = all(key in row for row, _ in rows.values() for key in _LENS)
     matrix = np.eye(3) if has_lenses else _matrix(folder / MATRIX)
@@ -75,7 +75,7 @@ def parse_stray_scanner(folder: Path, given: UserInputs = UserInputs()) -> Captu
 def _matrix(path: Path) -> np.ndarray:
     rows = read_rows(path, "expected 3 lines of 3 numbers", separator=",")
     if len(rows) != 3:
-        raise malformed(str(path), f"has {several(len(rows), 'line')}", "expected a matrix: 3 lines of 3 numbers")
+        raise malformed(path, f"has {several(len(rows), 'line')}", "expected a matrix: 3 lines of 3 numbers")
     return np.array([numbers(cells, 3, where) for cells, where in rows])
 
 
@@ -84,7 +84,7 @@ def _rows(path: Path) -> dict[int, tuple[dict[str, str], str]]:
     lines = read_rows(path, _EXPECTED, separator=",")
     header = [word.lower() for word in lines[0].cells] if lines else []
     if missing := [key for key in ("frame", *_POSE) if key not in header]:
-        raise malformed(str(path), f"has no column {missing[0]}", _EXPECTED)
+        raise malformed(path, f"has no column {missing[0]}", _EXPECTED)
     rows = {}
     for cells, where in lines[1:]:
         if len(cells) != len(header):

@@ -112,7 +112,7 @@ def _kitti_poses(path: Path) -> Poses:
 
 def _usable(poses: list[tuple[str, np.ndarray | None]], usable: FramePoses, path: Path, expected: str) -> Poses:
     if not poses:
-        raise malformed(str(path), "has no pose", expected)
+        raise malformed(path, "has no pose", expected)
     return [(name, pose) for name, pose in poses if pose is not None], usable.notes()
 
 

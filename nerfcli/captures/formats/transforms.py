@@ -106,9 +106,7 @@ def records_of(path: Path, content: dict[str, Any], key: str = "frames") -> list
     """Return the entries of a list of frames, with the keys of the whole file, and their places in it."""
     records = content.get(key)
     if not isinstance(records, list) or not records or not all(isinstance(item, dict) for item in records):
-        raise malformed(
-            str(path), f"has no list of {key}", f'expected "{key}": [{{"file_path", "transform_matrix"}}, ...]'
-        )
+        raise malformed(path, f"has no list of {key}", f'expected "{key}": [{{"file_path", "transform_matrix"}}, ...]')
     return [(merged(content, record), f"{path}: {key}[{index}]") for index, record in enumerate(records)]
 
 
@@ -253,7 +251,7 @@ def _points_beside(path: Path, content: dict[str, Any]) -> tuple[np.ndarray, np.
     if cloud is None or cloud == "":
         return np.zeros((0, 3)), None, ()
     if not isinstance(cloud, str):
-        raise malformed(str(path), f"ply_file_path is {cloud!r:.80}", "expected the path of a PLY file as text")
+        raise malformed(path, f"ply_file_path is {cloud!r:.80}", "expected the path of a PLY file as text")
     name = PurePosixPath(plain_name(cloud)).name
     same = (there for there in sorted(path.parent.iterdir()) if folded(there.name) == folded(name))
     places = (path.parent / plain_name(cloud), path.parent / name, *same)
@@ -272,9 +270,7 @@ def _listed_splits(path: Path, content: dict[str, Any]) -> dict[str, str]:
     for split in SPLITS:
         names = content.get(f"{split}_filenames", [])
         if not isinstance(names, list) or not all(isinstance(item, str) for item in names):
-            raise malformed(
-                str(path), f"{split}_filenames is not a list of paths", "expected a list of file_path texts"
-            )
+            raise malformed(path, f"{split}_filenames is not a list of paths", "expected a list of file_path texts")
         splits.update({plain_name(item): split for item in names})
     return splits
 
