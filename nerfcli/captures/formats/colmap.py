@@ -41,7 +41,7 @@ def is_model(folder: Path) -> bool:
     return any(all((folder / f"{name}{suffix}").is_file() for name in FILES[:2]) for suffix in _ENCODINGS)
 
 
-def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
+def parse_colmap(model_dir: Path) -> Capture:
     """Read a COLMAP model: cameras, poses, points with colours, and all 2D features.
 
     Frames are in the order of their image ids, and frames of one camera share the camera object. A capture does not
@@ -49,14 +49,13 @@ def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
 
     Args:
         model_dir: holds cameras, images and points3D, as .bin (which wins) or .txt; points3D may be missing.
-        image_dir: the folder that the names of the images are relative to; nothing is looked up there.
 
     Raises:
         UserError: a file is missing, truncated or inconsistent; the file is named.
     """
     model = read_model(model_dir)
     try:
-        return capture_of(model, image_dir)
+        return capture_of(model)
     except ValueError as error:
         raise UserError(
             f"{_file(model_dir, 'images')} and {_file(model_dir, 'points3D').name} do not belong together: {error}",

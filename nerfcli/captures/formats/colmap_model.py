@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -92,7 +91,7 @@ def images_of_rows(rows: list[ImageRow]) -> tuple[list[ColmapImage], tuple[str, 
     return images, notes
 
 
-def capture_of(model: ColmapModel, image_dir: Path | None) -> Capture:
+def capture_of(model: ColmapModel) -> Capture:
     """Convert a model to a capture, with frames ordered by image id.
 
     Cameras stay shared: frames of one camera id hold the same object. If the model has no points at all (some people
@@ -103,15 +102,7 @@ def capture_of(model: ColmapModel, image_dir: Path | None) -> Capture:
         ValueError: a feature has a point that is not in the model, or two points have the same id.
     """
     images = sorted(model.images, key=lambda image: image.image_id)
-    frames = tuple(
-        Frame(
-            image.name,
-            model.cameras[image.camera_id],
-            image.world_from_cam,
-            image=None if image_dir is None else image_dir / image.name,
-        )
-        for image in images
-    )
+    frames = tuple(Frame(image.name, model.cameras[image.camera_id], image.world_from_cam) for image in images)
     counts = [len(image.pixels) for image in images]
     observations = None
     if sum(counts):

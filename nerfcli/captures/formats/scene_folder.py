@@ -193,10 +193,16 @@ def parse_scene(root: Path, given: UserInputs = UserInputs()) -> Capture:
     masks, splits = _listed_masks(content, path, place), _listed_splits(content, path)
     depths, bounds = _listed_depths(content, path, place), _listed_bounds(content, path)
     photos = place(image_folder)
-    capture = parse_colmap(root / model, given.images or photos)
-    capture = with_photos(capture, root, given=given.images or (photos if photos.is_dir() else None))
+    there = given.images or (photos if photos.is_dir() else None)
+    capture = with_photos(parse_colmap(root / model), root, given=there)
     frames = tuple(
-        replace(f, mask=_mask_of(f.name, masks, path), depth=depths.get(f.name), split=splits.get(f.name, "train"))
+        replace(
+            f,
+            image=f.image or photos / f.name,
+            mask=_mask_of(f.name, masks, path),
+            split=splits.get(f.name, "train"),
+            depth=depths.get(f.name),
+        )
         for f in capture.frames
     )
     known = [bounds[frame.name] for frame in frames if frame.name in bounds]
