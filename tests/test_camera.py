@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.captures.orientation import fit_to_picture, turned
+from nerfcli.captures.orientation import Picture, fit_to_picture, turned
 from nerfcli.errors import UserError
 
 WIDTH, HEIGHT = 100, 80
@@ -209,18 +209,18 @@ def test_a_calibration_is_fitted_to_the_picture_on_disk(tmp_path):
     camera, pose, path = camera_of("PINHOLE"), np.eye(4), tmp_path / "a.jpg"
     # Stored on its side, shown upright; the calibration is for the stored pixels, or already for the upright ones.
     for calibrated in (camera, turned(camera, pose, orientation=6)[0]):
-        fitted, _ = fit_to_picture(calibrated, pose, path=path, measured=(40, 50, 6))
+        fitted, _ = fit_to_picture(calibrated, pose, Picture(path, 40, 50, 6))
         assert (fitted.width, fitted.height) == (40, 50)
         np.testing.assert_allclose(fitted.params, (39.5, 40, 20.5, 25.5))
-    untouched, same = fit_to_picture(camera, pose, path=path, measured=(100, 80, 1))
+    untouched, same = fit_to_picture(camera, pose, Picture(path, 100, 80, 1))
     assert untouched is camera
     assert same is pose
     with pytest.raises(UserError, match=r"a\.jpg: a picture of 90x90 pixels does not match a camera of 100x80"):
-        fit_to_picture(camera, pose, path=path, measured=(90, 90, 1))
+        fit_to_picture(camera, pose, Picture(path, 90, 90, 1))
     with pytest.raises(UserError, match="orientation 5 mirrors"):
-        fit_to_picture(camera, pose, path=path, measured=(80, 100, 5))
+        fit_to_picture(camera, pose, Picture(path, 80, 100, 5))
     with pytest.raises(UserError, match=r"a\.jpg: a spherical picture with EXIF orientation 6"):
-        fit_to_picture(camera_of("EQUIRECTANGULAR"), pose, path=path, measured=(80, 100, 6))
+        fit_to_picture(camera_of("EQUIRECTANGULAR"), pose, Picture(path, 80, 100, 6))
 
 
 def test_a_picture_contains_its_left_and_upper_edge_but_not_the_others():

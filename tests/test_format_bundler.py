@@ -12,6 +12,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.bundler import find_bundler, parse_bundler
 from nerfcli.captures.formats.format import UserInputs
+from nerfcli.captures.orientation import Picture
 from nerfcli.errors import BAD_INPUT, UserError
 
 LENSES = [(60.0, 0.1, -0.05), (55.0, 0.02, 0.0), (50.0, 0.0, 0.0)]
@@ -22,7 +23,7 @@ SIZE = (64, 48)
 
 @pytest.fixture(autouse=True)
 def _photos_of_one_size(monkeypatch):
-    monkeypatch.setattr("nerfcli.captures.orientation.measure", lambda path: (*SIZE, 1))
+    monkeypatch.setattr("nerfcli.captures.orientation.measure", lambda path: Picture(path, *SIZE, 1))
 
 
 def bundler_cameras() -> list[tuple[np.ndarray, np.ndarray]]:

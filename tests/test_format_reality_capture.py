@@ -9,6 +9,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.reality_capture import parse_reality_capture
+from nerfcli.captures.orientation import Picture
 from nerfcli.errors import BAD_INPUT, UserError
 
 OLD = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"
@@ -31,8 +32,8 @@ SIZES = {"wide": (64, 48), "tall": (48, 64)}
 def _sizes_by_name(monkeypatch):
     """The name gives the size; on.jpg is stored sideways and shown upright."""
 
-    def measure(path: Path) -> tuple[int, int, int]:
-        return (48, 64, 6) if path.stem == "on" else (*SIZES.get(path.stem, (64, 48)), 1)
+    def measure(path: Path) -> Picture:
+        return Picture(path, 48, 64, 6) if path.stem == "on" else Picture(path, *SIZES.get(path.stem, (64, 48)), 1)
 
     monkeypatch.setattr("nerfcli.captures.orientation.measure", measure)
 

@@ -20,6 +20,7 @@ from nerfcli.captures.formats.transforms import (
 )
 from nerfcli.captures.formats.transforms_cameras import lost_to_transforms
 from nerfcli.captures.loading import load_scene
+from nerfcli.captures.orientation import Picture
 from nerfcli.errors import UserError
 
 LOST = {
@@ -40,7 +41,11 @@ OPENCV_POSE = [[0.0, 0.0, -1.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, -1.0, 0.0, 3.0
 @pytest.fixture
 def photos_of(monkeypatch):
     """Return a function that makes every file of a photo count as one of this size."""
-    return lambda *size: monkeypatch.setattr("nerfcli.captures.orientation.measure", lambda path: (*size, 1))
+
+    def set_size(width: int, height: int) -> None:
+        monkeypatch.setattr("nerfcli.captures.orientation.measure", lambda path: Picture(path, width, height, 1))
+
+    return set_size
 
 
 def write_json(path: Path, **content: object) -> Path:

@@ -22,9 +22,10 @@ from test_pose_stages import model, rows
 
 from nerfcli.cameras.alignment import align
 from nerfcli.cameras.camera import Camera
-from nerfcli.captures.calibration import Calibration, Picture, calibrated, read_calibration
+from nerfcli.captures.calibration import Calibration, calibrated, read_calibration
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.registry import format_named
+from nerfcli.captures.orientation import Picture
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport

@@ -14,8 +14,9 @@ from in_this_process import poses_in_this_process
 from PIL import Image
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.captures.calibration import Calibration, Picture, calibrated
+from nerfcli.captures.calibration import Calibration, calibrated
 from nerfcli.captures.loading import load_scene
+from nerfcli.captures.orientation import Picture
 from nerfcli.errors import BAD_INPUT
 from nerfcli.photos.images import list_photos
 from nerfcli.photos.masks import find_mask

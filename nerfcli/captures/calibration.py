@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from nerfcli.captures.formats.fields import read_json_object
 from nerfcli.captures.formats.format import UserInputs, find_json, named
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.captures.formats.scene_folder import MODEL_FOLDER, SCENE_FILE
-from nerfcli.captures.orientation import UPRIGHT, fit_to_picture
+from nerfcli.captures.orientation import UPRIGHT, Picture, fit_to_picture
 from nerfcli.errors import UserError
 
 _SIZES_SHOWN = 4
@@ -46,16 +46,6 @@ class Calibration:
     def to_json(self) -> dict[str, str]:
         """Return {"file", "key"}, the record of the calibration that a scene keeps."""
         return {"file": str(self.path.absolute()), "key": self.key}
-
-
-@dataclass(frozen=True)
-class Picture:
-    """The data by which a photo's calibration is looked up: its file, upright size and EXIF orientation."""
-
-    path: Path
-    width: int
-    height: int
-    orientation: int
 
 
 @dataclass(frozen=True)
@@ -95,11 +85,9 @@ def _of_picture(calibration: Calibration, picture: Picture, same_name: Mapping[s
     if listed:
         number = next(iter(listed))
         return PhotoCalibration(_fitted(calibration, number, picture), number, by_name=True)
-    size = {picture.width, picture.height}
-    sizes = [{camera.width, camera.height} for camera in calibration.cameras]
-    fitting = [n for n in range(len(sizes)) if sizes[n] == size and _fits(calibration, n, picture)]
-    if not fitting:
-        fitting = [n for n in range(len(sizes)) if _fits(calibration, n, picture)]
+    fitting = [n for n in range(len(calibration.cameras)) if _fits(calibration, n, picture)]
+    of_size = [n for n in fitting if set(calibration.cameras[n].size) == set(picture.size)]
+    fitting = of_size or fitting
     if len(fitting) == 1:
         return PhotoCalibration(_fitted(calibration, fitting[0], picture), fitting[0], by_name=False)
     what = f"photo {picture.path.name} of {picture.width}x{picture.height}"
@@ -119,18 +107,13 @@ def _of_picture(calibration: Calibration, picture: Picture, same_name: Mapping[s
 
 def _fits(calibration: Calibration, number: int, picture: Picture) -> bool:
     """Return whether a camera has the aspect ratio of a picture, upright or as stored."""
-    camera = calibration.cameras[number]
-    shapes = [(picture.width, picture.height)]
-    if not calibration.upright and picture.orientation >= 5:
-        shapes.append((picture.height, picture.width))
-    return any(camera.has_shape(*shape) for shape in shapes)
+    shapes = {picture.size} if calibration.upright else {picture.size, picture.stored_size}
+    return any(calibration.cameras[number].has_shape(*shape) for shape in shapes)
 
 
 def _fitted(calibration: Calibration, number: int, picture: Picture) -> Camera:
-    orientation = 1 if calibration.upright else picture.orientation
-    measured = (picture.width, picture.height, orientation)
-    camera, _ = fit_to_picture(calibration.cameras[number], np.eye(4), path=picture.path, measured=measured)
-    return camera
+    picture = replace(picture, orientation=1) if calibration.upright else picture
+    return fit_to_picture(calibration.cameras[number], np.eye(4), picture)[0]
 
 
 _CAMERAS_FILES = ("cameras.bin", "cameras.txt")

@@ -15,7 +15,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.axes import Convention, for_picture
 from nerfcli.captures.capture import Capture
-from nerfcli.errors import UserError
+from nerfcli.captures.orientation import resized_for
 from nerfcli.matching.agreement import agreement, fundamental_matrix, rays_of
 from nerfcli.matching.features import Features, Matches, find_features, mutual_matches
 from nerfcli.photos.images import read_image
@@ -99,10 +99,8 @@ def _stored_or_shown(camera: Camera, path: Path) -> tuple[np.ndarray, Camera]:
             break
     if grey is None:  # OpenCV reads neither HEIC nor TGA; of a damaged file, the error of `read_image` says more
         grey = cv2.cvtColor(np.ascontiguousarray(read_image(path)[..., :3]), cv2.COLOR_RGB2GRAY)
-    try:
-        return grey, camera.resized(*grey.shape[::-1])
-    except UserError as error:
-        raise UserError(f"{path}: {error.message}", error.hint) from error
+    height, width = grey.shape
+    return grey, resized_for(camera, (width, height), path)
 
 
 def _matched(first: tuple[Camera, Features], second: tuple[Camera, Features]) -> tuple[np.ndarray, np.ndarray] | None:

@@ -19,9 +19,6 @@ from nerfcli.errors import UserError
 from nerfcli.photos.exif import read_exif
 from nerfcli.photos.images import image_size
 
-# An image file's width and height, EXIF orientation applied, and that orientation (1 if none).
-Measured = tuple[int, int, int]
-
 # Rotations upright_from_stored of the picture, in (x right, y down): EXIF 3 is half a turn, 6 a quarter clockwise,
 # 8 a quarter counter-clockwise. Source: Exif 2.32, tag 0x0112.
 _TURNS = {
@@ -41,15 +38,38 @@ _VECTORS = {
 }
 
 
+@dataclass(frozen=True)
+class Picture:
+    """A photo on disk: its file, its size as it is shown upright, and its EXIF orientation, 1 if it has none."""
+
+    path: Path
+    width: int
+    height: int
+    orientation: int
+
+    @property
+    def size(self) -> Size:
+        """Width and height upright."""
+        return self.width, self.height
+
+    @property
+    def stored_size(self) -> Size:
+        """Width and height before the orientation is applied."""
+        return (self.height, self.width) if self.orientation >= 5 else self.size
+
+
+def measure(path: Path) -> Picture:
+    """Read the size of a photo and its EXIF orientation."""
+    exif = read_exif(path)
+    return Picture(path, exif.width, exif.height, exif.orientation)
+
+
 def stored_size(path: Path) -> Size:
     """Return the width and height of an image file before its EXIF orientation is applied."""
-    width, height, orientation = measure(path)
-    return (height, width) if orientation >= 5 else (width, height)
+    return measure(path).stored_size
 
 
-def fit_to_picture(
-    camera: Camera, world_from_cam: np.ndarray, *, path: Path, measured: Measured
-) -> tuple[Camera, np.ndarray]:
+def fit_to_picture(camera: Camera, world_from_cam: np.ndarray, picture: Picture) -> tuple[Camera, np.ndarray]:
     """Return the camera and pose for the upright picture on disk.
 
     The calibration is taken to be for the stored pixels, or for the upright ones if its aspect ratio fits those better,
@@ -58,15 +78,19 @@ def fit_to_picture(
     Raises:
         UserError: neither aspect ratio fits (both sizes are named), or see `turn_to_upright`.
     """
-    orientation, size = turn_to_upright(camera, measured, path=path)
+    orientation, size = turn_to_upright(camera, picture)
+    return turned(resized_for(camera, size, picture.path), world_from_cam, orientation=orientation)
+
+
+def resized_for(camera: Camera, size: Size, path: Path) -> Camera:
+    """Return `Camera.resized` to the size of a photo; its error names the photo."""
     try:
-        resized = camera.resized(*size)
+        return camera.resized(*size)
     except UserError as error:
         raise UserError(f"{path}: {error.message}", error.hint) from error
-    return turned(resized, world_from_cam, orientation=orientation)
 
 
-def turn_to_upright(camera: Camera, measured: Measured, *, path: Path) -> tuple[int, Size]:
+def turn_to_upright(camera: Camera, picture: Picture) -> tuple[int, Size]:
     """Return the EXIF orientation that turns a camera's picture upright, and the size of the picture on disk.
 
     The orientation is 1 if the camera is for the upright picture already. The size is of the picture as the camera
@@ -75,16 +99,15 @@ def turn_to_upright(camera: Camera, measured: Measured, *, path: Path) -> tuple[
     Raises:
         UserError: the EXIF orientation mirrors the picture, or turns one of the whole sphere.
     """
-    width, height, orientation = measured
+    orientation, stored, upright = picture.orientation, picture.stored_size, picture.size
     if orientation not in _TURNS:
         raise UserError(
-            f"{path}: EXIF orientation {orientation} mirrors the photo, which is not supported",
+            f"{picture.path}: EXIF orientation {orientation} mirrors the photo, which is not supported",
             "save the photo upright without the tag and estimate the poses again",
         )
-    stored = (height, width) if orientation >= 5 else (width, height)
-    if stored != (width, height) and _shape_error(camera, stored) > _shape_error(camera, (width, height)):
-        return 1, (width, height)
-    _refuse_sphere(camera, orientation, path)
+    if stored != upright and _shape_error(camera, stored) > _shape_error(camera, upright):
+        return 1, upright
+    _refuse_sphere(camera, picture)
     return orientation, stored
 
 
@@ -163,15 +186,9 @@ class ReorientedCapture:
     masks_left_out: tuple[str, ...] = ()
 
 
-def measure(path: Path) -> Measured:
-    """Read the size of a photo and its EXIF orientation."""
-    exif = read_exif(path)
-    return exif.width, exif.height, exif.orientation
-
-
-def _measured(path: Path, pixels: str) -> Measured:
+def _measured(path: Path, pixels: str) -> Picture:
     """Measure a photo for a camera that refers to these pixels: for one of upright photos, nothing is left to turn."""
-    return (*image_size(path), 1) if pixels == UPRIGHT else measure(path)
+    return Picture(path, *image_size(path), 1) if pixels == UPRIGHT else measure(path)
 
 
 def in_pixels(capture: Capture, pixels: str) -> ReorientedCapture:
@@ -209,8 +226,7 @@ def in_pixels(capture: Capture, pixels: str) -> ReorientedCapture:
 def upright(frame: Frame, pixels: str) -> Frame:
     """Return a frame fitted to its upright photo on disk, whose camera refers to stored or upright pixels."""
     assert frame.image is not None
-    measured = _measured(frame.image, pixels)
-    camera, pose = fit_to_picture(frame.camera, frame.world_from_cam, path=frame.image, measured=measured)
+    camera, pose = fit_to_picture(frame.camera, frame.world_from_cam, _measured(frame.image, pixels))
     return replace(frame, camera=camera, world_from_cam=pose)
 
 
@@ -229,11 +245,11 @@ def other_sizes(capture: Capture) -> dict[tuple[Size, Size], int]:
             continue
         assert frame.image is not None
         try:
-            measured = _measured(frame.image, capture.pixels)
-            turn_to_upright(frame.camera, measured, path=frame.image)
+            picture = _measured(frame.image, capture.pixels)
+            turn_to_upright(frame.camera, picture)
         except UserError:  # the commands that use the photos say what is wrong with them
             continue
-        fitted, _ = fit_to_picture(frame.camera, frame.world_from_cam, path=frame.image, measured=measured)
+        fitted, _ = fit_to_picture(frame.camera, frame.world_from_cam, picture)
         sizes.append(rescaling(frame.camera, fitted))
     return counted(sizes)
 
@@ -256,23 +272,20 @@ def _turned_observations(capture: Capture, turns: np.ndarray) -> Observations | 
 def _turn(frame: Frame, pixels: str) -> int:
     """Return the EXIF orientation that turns the pixels of a frame's camera into the requested ones."""
     assert frame.image is not None
-    measured = width, height, written = measure(frame.image)
-    orientation, size = turn_to_upright(frame.camera, measured, path=frame.image)
+    picture = measure(frame.image)
+    orientation, size = turn_to_upright(frame.camera, picture)
     if pixels == STORED:
-        orientation, size = {6: 8, 8: 6}.get(written, written), (width, height)  # turned back
-        _refuse_sphere(frame.camera, written, frame.image)
-    try:
-        frame.camera.resized(*size)
-    except UserError as error:
-        raise UserError(f"{frame.image}: {error.message}", error.hint) from error
+        orientation, size = {6: 8, 8: 6}.get(picture.orientation, picture.orientation), picture.size  # turned back
+        _refuse_sphere(frame.camera, picture)
+    resized_for(frame.camera, size, frame.image)
     return orientation
 
 
-def _refuse_sphere(camera: Camera, orientation: int, path: Path) -> None:
+def _refuse_sphere(camera: Camera, picture: Picture) -> None:
     """Refuse to turn a picture of the whole sphere, whose camera cannot be turned about an optical axis."""
-    if orientation != 1 and camera.is_spherical:
+    if picture.orientation != 1 and camera.is_spherical:
         raise UserError(
-            f"{path}: a spherical picture with EXIF orientation {orientation}",
+            f"{picture.path}: a spherical picture with EXIF orientation {picture.orientation}",
             "save the panorama upright without the tag",
         )
 

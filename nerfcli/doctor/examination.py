@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.captures.calibration import Calibration, Picture, calibrated
+from nerfcli.captures.calibration import Calibration, calibrated
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.registry import recognised, refuse_archive
 from nerfcli.captures.loading import load_scene
+from nerfcli.captures.orientation import Picture
 from nerfcli.doctor import camera_layout, geometry, inventory, quality
 from nerfcli.doctor.compared_pairs import Pair, choose_pairs, compare, pair_count
 from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, Source, read_all

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from nerfcli.captures.calibration import Calibration, PhotoCalibration, Picture, calibrated
-from nerfcli.captures.orientation import counted, describe_rescaling, rescaling
+from nerfcli.captures.calibration import Calibration, PhotoCalibration, calibrated
+from nerfcli.captures.orientation import Picture, counted, describe_rescaling, rescaling
 from nerfcli.errors import UserError, several
 from nerfcli.photos.exif import Exif
 from nerfcli.photos.focal_evidence import focal_evidence
