@@ -77,15 +77,9 @@ def scale_from_corners(
 
 def triangulate(frames: Sequence[Frame], sightings: Sightings) -> tuple[dict[Any, np.ndarray], dict[Any, str]]:
     """Return the points (3,) that photos show in several places, and why the others cannot be triangulated."""
-    points: dict[Any, np.ndarray] = {}
-    reasons: dict[Any, str] = {}
-    for corner, rays in _rays(frames, sightings).items():
-        point = _triangulated(rays)
-        if isinstance(point, str):
-            reasons[corner] = point
-        else:
-            points[corner] = point
-    return points, reasons
+    found = {corner: _triangulated(rays) for corner, rays in _rays(frames, sightings).items()}
+    points = {corner: point for corner, point in found.items() if not isinstance(point, str)}
+    return points, {corner: reason for corner, reason in found.items() if isinstance(reason, str)}
 
 
 def _rays(frames: Sequence[Frame], sightings: Sightings) -> dict[Any, list[tuple[Frame, np.ndarray]]]:
