@@ -1,16 +1,15 @@
 """OpenSfM's reconstruction.json against OpenSfM's own formulas written out here, by hand, and in round trips."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from captures import ring
 
-from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Frame
-from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats.opensfm import losses_opensfm, parse_opensfm, write_opensfm
 from nerfcli.errors import BAD_INPUT, UserError
 
@@ -121,30 +120,18 @@ def test_the_unit_is_the_metre_after_scaling_by_gps(tmp_path, reference, unit):
     assert parse_opensfm(path).unit == unit
 
 
-def capture_of(cameras: list[Camera], *, num_frames: int = 6) -> Capture:
-    rng = np.random.default_rng(1)
-    points = rng.normal(size=(40, 3))
-    frames = []
-    for index in range(num_frames):
-        pose = rigid.look_at(6 * rng.normal(size=3), rng.normal(size=3), rng.normal(size=3))
-        frames.append(Frame(f"ring 1/ä {index}.jpg", cameras[index % len(cameras)], pose))
-    return Capture(tuple(frames), points, (), None, "colmap", colours=rng.integers(0, 256, (40, 3), dtype=np.uint8))
-
-
 def test_losses_are_reported(tmp_path):
     ratio = Camera("FULL_OPENCV", 64, 48, (50, 50, 32, 24, 0.1, 0, 0, 0, 0, 0.2, 0, 0.3))
-    capture = capture_of([ratio, Camera("FOV", 64, 48, (50, 50, 32, 24, 0.5))])
-    frames = (*capture.frames[:-1], Frame("m", ratio, np.eye(4), mask=Path("m.png"), split="test"))
-    seen = Observations(np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.int64), np.zeros((3, 2)))
-    full = Capture(
-        frames, capture.points, (), np.ones((6, 2)), "x", colours=capture.colours, observations=seen, unit="metre"
-    )
+    capture = ring(ratio, Camera("FOV", 64, 48, (50, 50, 32, 24, 0.5)))
+    assert capture.observations is not None
+    frames = (*capture.frames[:-1], replace(capture.frames[-1], mask=Path("m.png"), split="test"))
+    full = replace(capture, frames=frames, depth_bounds=np.ones((6, 2)), unit="metre")
     assert losses_opensfm(full) == (
         "k4 of 1 camera",
         "k6 of 1 camera",
         "the FOV lens of 1 camera",
         "1 mask",
-        "3 observations",
+        f"{len(capture.observations.pixels)} observations",
         "the split of 1 frame",
         "depth bounds",
         "the unit of length (metre)",
