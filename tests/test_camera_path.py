@@ -17,7 +17,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.camera_path import (
-    is_camera_path,
+    find_camera_path,
     losses_camera_path,
     parse_camera_path,
     read_path,
@@ -90,8 +90,8 @@ def test_frames_per_second(tmp_path, more, fps):
 
 
 def test_a_camera_path_is_distinguished_from_other_files_and_parsed_as_a_capture(tmp_path):
-    assert is_camera_path(content())
-    assert not is_camera_path({"frames": [], "fl_x": 1.0})
+    assert find_camera_path(written(tmp_path, content())) is not None
+    assert find_camera_path(written(tmp_path, {"frames": [], "fl_x": 1.0, "camera_path": []})) is None
     nested = content(camera_type="Perspective", keyframes=[{"matrix": "[1, 2]"}])
     nested["camera_path"][0]["camera_to_world"] = np.array(OPENGL_POSE).reshape(4, 4).tolist()
     capture = parse_camera_path(written(tmp_path, nested))

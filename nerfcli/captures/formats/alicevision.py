@@ -39,13 +39,10 @@ from nerfcli.captures.formats.photo_names import find_photos
 FILES = ("cameras.sfm", "sfm.sfm", "sfm.json")
 
 _EXPECTED = "expected the .sfm or .json file of AliceVision's StructureFromMotion or ConvertSfMFormat"
+_LISTS = ("version", "views", "intrinsics", "poses")
 # Number of distortion terms by the names of lenses; later versions name distortion apart, with the type pinhole.
 _RADIAL = {"pinhole": 0, "none": 0, "radial1": 1, "radialk1": 1, "radial3": 3, "radialk3": 3, "brown": 5}
 _FISHEYE = ("fisheye4", "fisheye")
-
-
-def _is_alicevision(content: dict[str, Any]) -> bool:
-    return all(isinstance(content.get(key), list) for key in ("version", "views", "intrinsics", "poses"))
 
 
 def parse_alicevision(path: Path, given: UserInputs = UserInputs()) -> Capture:
@@ -54,7 +51,7 @@ def parse_alicevision(path: Path, given: UserInputs = UserInputs()) -> Capture:
     Photos are where the file says, or, as it usually comes from another machine, in the given folder or beside it.
     """
     content = read_json_object(path)
-    if not _is_alicevision(content):
+    if not all(isinstance(content.get(key), list) for key in _LISTS):
         raise malformed(path, "has no version, views, intrinsics or poses", _EXPECTED)
     version = tuple(int(number) for number in _numbers(content["version"], 3, f"{path}: version"))
     cameras = {
@@ -180,7 +177,7 @@ def find_alicevision(path: Path) -> Path | None:
     """Find a file .sfm, or a .json that is a reconstruction of AliceVision."""
     found = by_suffix(".sfm", *FILES)(path)
     if found is None and path.is_file() and path.suffix.lower() == ".json":
-        return path if has_keys(path, b'"featuresFolders"', _is_alicevision) else None
+        return path if has_keys(path, "featuresFolders", *_LISTS) else None
     return found
 
 

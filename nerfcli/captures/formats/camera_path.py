@@ -47,11 +47,6 @@ class CameraPath:
     fps: float
 
 
-def is_camera_path(content: dict[str, Any]) -> bool:
-    """Return whether a JSON object is a camera path rather than a transforms.json."""
-    return "camera_path" in content and "frames" not in content
-
-
 def read_path(path: Path) -> CameraPath:
     """Read the path in a nerfstudio camera-path JSON; without fps or seconds it has 24 frames per second."""
     content = read_json_object(path)
@@ -183,7 +178,7 @@ def find_camera_path(path: Path) -> Path | None:
     found = find_json(path, opening="{", name="camera_path.json")
     if found is None or path.is_dir():
         return found
-    return found if has_keys(found, b'"camera_path"', is_camera_path) else None
+    return found if has_keys(found, "camera_path") and not has_keys(found, "frames") else None
 
 
 FORMAT = Format(

@@ -124,9 +124,9 @@ def find_json(path: Path, *, opening: str, name: str) -> Path | None:
         return path if stream.read(1000).lstrip().startswith(opening) else None
 
 
-def has_keys(path: Path, text: bytes, test: Callable[[dict[str, Any]], bool]) -> bool:
-    """Return whether a JSON object passes a test; it is parsed only if it contains a text."""
+def has_keys(path: Path, *keys: str) -> bool:
+    """Return whether a file is a JSON object with these keys; it is parsed only if it contains the first of them."""
     try:
-        return text in path.read_bytes() and test(read_json_object(path))
+        return f'"{keys[0]}"'.encode() in path.read_bytes() and set(keys) <= set(read_json_object(path))
     except UserError:  # damaged, or another program's file of this name
         return False

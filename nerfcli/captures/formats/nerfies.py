@@ -132,7 +132,7 @@ def find_nerfies(path: Path) -> Path | None:
     folder = path.parent.parent if path.parent.name == CAMERAS else path
     folder = path.parent if path.is_file() and path.name == DATASET else folder
     first = next((folder / CAMERAS).glob("*.json"), None)
-    return folder if first and has_keys(first, b'"orientation"', lambda content: "position" in content) else None
+    return folder if first and has_keys(first, "orientation", "position") else None
 
 
 FORMAT = Format(

@@ -153,8 +153,7 @@ def _structure(content: dict[str, Any], frame_of: dict[int, int], path: Path) ->
 def find_openmvg(path: Path) -> Path | None:
     """Find an sfm_data.json of OpenMVG, in a folder or in that of a reconstruction in it."""
     found = path if path.is_file() and path.suffix.lower() == ".json" else named(*FILES)(path)
-    keys = {"sfm_data_version", "views", "intrinsics", "extrinsics"}
-    return found if found and has_keys(found, b'"sfm_data_version"', lambda content: keys <= set(content)) else None
+    return found if found and has_keys(found, "sfm_data_version", "views", "intrinsics", "extrinsics") else None
 
 
 FORMAT = Format(

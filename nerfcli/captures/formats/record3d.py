@@ -77,8 +77,7 @@ def _intrinsics(content: dict[str, Any], count: int, where: str) -> np.ndarray:
 def find_record3d(path: Path) -> Path | None:
     """Find the file metadata.json, or metadata, of a capture by Record3D."""
     found = path if path.is_file() and path.name in FILES else named(*FILES)(path)
-    keys = {_POSES, "K", "w", "h"}
-    return found if found and has_keys(found, b'"poses"', lambda content: keys <= set(content)) else None
+    return found if found and has_keys(found, _POSES, "K", "w", "h") else None
 
 
 FORMAT = Format(

@@ -57,8 +57,7 @@ def parse_scanner_app(folder: Path, given: UserInputs = UserInputs()) -> Capture
 def find_scanner_app(path: Path) -> Path | None:
     """Find the folder of a capture, given it or the file of a frame."""
     files = [path] if path.is_file() and _FRAME.fullmatch(path.name) else frame_files(path)
-    is_frame = files and has_keys(files[0], f'"{_POSE}"'.encode(), lambda content: "intrinsics" in content)
-    return files[0].parent if is_frame else None
+    return files[0].parent if files and has_keys(files[0], _POSE, "intrinsics") else None
 
 
 FORMAT = Format(

@@ -51,9 +51,7 @@ def parse_scannetpp(path: Path, given: UserInputs = UserInputs()) -> Capture:
 def find_scannetpp(path: Path) -> Path | None:
     """Find a transforms.json with test_frames, given the scene, its folder dslr, that of the file, or the file."""
     if path.is_file():
-        is_json = path.suffix.lower() == ".json"
-        has_lists = is_json and has_keys(path, f'"{_HELD_OUT}"'.encode(), lambda content: "frames" in content)
-        return path if has_lists else None
+        return path if path.suffix.lower() == ".json" and has_keys(path, _HELD_OUT, "frames") else None
     files = (path / place / name for place in _PLACES for name in FILES)
     return next((file for file in files if file.is_file() and find_scannetpp(file)), None)
 
