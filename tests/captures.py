@@ -77,6 +77,13 @@ def photograph(frames: Sequence[Frame]) -> None:
         Image.new("L", frame.camera.size).save(frame.image)
 
 
+def put_photos(folder: Path, *names: str) -> None:
+    """Put pictures of 64 x 48 pixels into a folder."""
+    for path in (folder / name for name in names):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", (64, 48)).save(path)
+
+
 def with_photos(capture: Capture, folder: Path) -> Capture:
     """Return the capture with image paths in a folder, named like the frames."""
     return replace(capture, frames=tuple(replace(frame, image=folder / frame.name) for frame in capture.frames))

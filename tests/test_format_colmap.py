@@ -1,4 +1,4 @@
-"""COLMAP models written and read, against pycolmap and by round trips."""
+"""COLMAP models written and read, against pycolmap, by round trips and by hand."""
 
 from dataclasses import replace
 
@@ -11,9 +11,11 @@ from readback import assert_holds, read_colmap
 from nerfcli.cameras import rigid
 from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats.colmap import (
+    is_model,
     losses_colmap,
     losses_colmap_text,
     parse_colmap,
+    read_model,
     write_colmap_binary,
     write_colmap_text,
 )
@@ -161,3 +163,54 @@ def test_an_announced_count_is_not_believed(tmp_path, name, count):
     path.write_bytes(count.to_bytes(8, "little") + path.read_bytes()[8:])
     with pytest.raises(UserError, match=f"{name} is damaged: it announces {count} records"):
         parse_colmap(tmp_path / "model")
+
+
+@pytest.mark.parametrize(
+    "name", ["cameras.bin", "images.bin", "points3D.bin", "cameras.txt", "images.txt", "points3D.txt"]
+)
+def test_a_damaged_file_is_named(tmp_path, name):
+    """A truncated file never causes a hang or passes as complete; pycolmap loops forever on some of them."""
+    WRITERS[name[-3:]](ring(CAMERAS["PINHOLE"]), tmp_path)
+    path = tmp_path / name
+    whole = path.read_bytes()
+    if name.endswith("bin"):
+        damaged = [whole[:size] for size in (0, 5, 20, len(whole) // 2, len(whole) - 1)] + [b"garbage " * 100]
+    else:
+        damaged = [b"garbage " * 100, b"\xff\xfe\xfd", b"1 2 3\n"]
+    for data in damaged:
+        path.write_bytes(data)
+        with pytest.raises(UserError, match=name.replace(".", r"\.")):
+            read_model(tmp_path)
+    path.unlink()
+    if name.startswith("points3D"):
+        assert is_model(tmp_path)
+        assert len(read_model(tmp_path).points) == 0
+        return
+    with pytest.raises(UserError, match=r"No such file|cameras\.txt"):
+        read_model(tmp_path)
+    assert not is_model(tmp_path)
+
+
+def test_text_by_hand(tmp_path):
+    """Names with spaces, images without points (an empty line), comments and a model without points."""
+    (tmp_path / "cameras.txt").write_text("# cameras\n3 PINHOLE 64 48 50 51 33 23\n")
+    (tmp_path / "images.txt").write_text("# images\n\n1 1 0 0 0 1 2 3 3 b c.jpg\n\n2 0 0 0 1 0 0 0 3 a.jpg\n1 2 -1\n")
+    (tmp_path / "points3D.txt").write_text("# points\n")
+    model = read_model(tmp_path)
+    assert [image.name for image in model.images] == ["a.jpg", "b c.jpg"]
+    np.testing.assert_allclose(model.images[1].world_from_cam[:3, 3], [-1, -2, -3])
+    np.testing.assert_allclose(model.images[0].world_from_cam[:3, :3], np.diag([-1, -1, 1]), rtol=0, atol=1e-15)
+    assert model.points.shape == (0, 3)
+    for text, what in (
+        ("1 1 0 0 0 1 2 3 4 a.jpg\n\n", "image a.jpg refers to camera 4, which does not exist"),
+        ("1 1 0 0 0 1 2 3 3 a.jpg\n\n2 1 0 0 0 1 2 3 3 a.jpg\n\n", "a.jpg is registered twice"),
+        (
+            "1 0 0 0 0 1 2 3 3 a.jpg\n\n",
+            r"txt: the pose of image a\.jpg is not finite, or .* of length 0; only 0 of 1 frame",
+        ),
+        ("1 1 0 0 0 nan 2 3 3 a.jpg\n\n", r"images\.txt: the pose of image a\.jpg is not finite"),
+        ("# nothing\n", "no registered images"),
+    ):
+        (tmp_path / "images.txt").write_text(text)
+        with pytest.raises(UserError, match=what):
+            read_model(tmp_path)

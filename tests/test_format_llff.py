@@ -5,14 +5,73 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from captures import CAMERAS, reprojection_px, ring
+from captures import CAMERAS, put_photos, reprojection_px, ring
+from test_format_transforms import OPENCV_POSE
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats.fields import array_of_npy
 from nerfcli.captures.formats.llff import losses_llff, parse_llff, write_llff
+from nerfcli.captures.loading import load_scene
 from nerfcli.errors import UserError
+
+# A camera at (1, 2, 3) that looks along -x with +z up, in LLFF's axes: down -z, right +y, backward +x.
+LLFF_POSE = [[0.0, 0.0, 1.0, 1.0], [0.0, 1.0, 0.0, 2.0], [-1.0, 0.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+def llff_rows(count: int) -> np.ndarray:
+    """Full size 256 x 192 with focal length 200; the centre of camera i is (1, 2, 3 + i)."""
+    rows = []
+    for index in range(count):
+        pose = np.array(LLFF_POSE)[:3]
+        pose[2, 3] += index
+        rows.append(np.concatenate([np.column_stack([pose, [192.0, 256.0, 200.0]]).ravel(), [1.5, 20.0 + index]]))
+    return np.array(rows)
+
+
+def test_llff_by_hand(tmp_path):
+    np.save(tmp_path / "poses_bounds.npy", llff_rows(2))
+    # images/ has a different number of photos than poses; images_4/ has the right number, at a quarter of the size.
+    put_photos(tmp_path, "images/1.jpg", "images_4/b.png", "images_4/a.png")
+    capture = load_scene(tmp_path)
+    assert [frame.name for frame in capture.frames] == ["images_4/a.png", "images_4/b.png"]
+    assert capture.frames[0].camera == Camera("PINHOLE", 64, 48, (50, 50, 32, 24))
+    np.testing.assert_allclose(capture.frames[0].world_from_cam, OPENCV_POSE, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(capture.frames[1].centre, [1, 2, 4])
+    np.testing.assert_array_equal(capture.depth_bounds, [[1.5, 20], [1.5, 21]])
+    assert capture.kind == "llff"
+    put_photos(tmp_path, "images/2.jpg")
+    assert load_scene(tmp_path).frames[0].name == "images/1.jpg"
+
+
+def test_malformed_llff_is_refused(tmp_path):
+    path = tmp_path / "poses_bounds.npy"
+    np.save(path, llff_rows(3))
+    with pytest.raises(UserError, match="none of its 3 photos is on disk, such as image000"):
+        load_scene(tmp_path)
+    put_photos(tmp_path, "images/1.jpg", "images_8/1.jpg", "images_8/2.jpg")
+    with pytest.raises(UserError, match="3 rows, but images/ has 1 photo, images_8/ has 2 photos"):
+        load_scene(tmp_path)
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(UserError, match=r"poses_bounds\.npy is not a readable NumPy array"):
+        load_scene(tmp_path)
+    path.write_bytes(b"")
+    with pytest.raises(UserError, match="not a readable NumPy array"):
+        load_scene(tmp_path)
+    np.save(path, llff_rows(3)[:, :15])
+    with pytest.raises(UserError, match=r"array of shape \(3, 15\)"):
+        load_scene(tmp_path)
+    for column, value, what in (
+        (15, 0.0, "depth bounds 0 and 20"),
+        (14, -1.0, "row 0: .* -1"),
+        (3, np.nan, "row 0: .*finite"),
+    ):
+        rows = llff_rows(1)
+        rows[0, column] = value
+        np.save(path, rows)
+        with pytest.raises(UserError, match=what):
+            load_scene(tmp_path)
 
 
 def pinhole_ring() -> Capture:

@@ -1,15 +1,18 @@
-"""transforms.json and Blender's files as captures: what they hold, and what they lose."""
+"""transforms.json and Blender's files as captures: by hand, what they hold, and what they lose."""
 
 import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from captures import CAMERAS, assert_same, photograph, reprojection_px, ring, with_photos
+from captures import CAMERAS, assert_same, photograph, put_photos, reprojection_px, ring, with_photos
 
+from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
+from nerfcli.captures.axes import pose_in_axes
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.blender import losses_blender, parse_blender, write_blender
 from nerfcli.captures.formats.format import UserInputs
@@ -21,7 +24,7 @@ from nerfcli.captures.formats.transforms import (
 from nerfcli.captures.formats.transforms_cameras import lost_to_transforms
 from nerfcli.captures.loading import load_scene
 from nerfcli.captures.orientation import Picture
-from nerfcli.errors import UserError
+from nerfcli.errors import BAD_INPUT, UserError
 
 LOST = {
     "FULL_OPENCV": ("k4", "k5", "k6"),
@@ -36,6 +39,7 @@ LOST = {
 # A camera at (1, 2, 3) that looks along -x with +z up: OpenGL axes, and OpenCV axes.
 OPENGL_POSE = [[0.0, 0.0, 1.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
 OPENCV_POSE = [[0.0, 0.0, -1.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, -1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+SHARED = {"fl_x": 50.0, "fl_y": 51.0, "cx": 33.0, "cy": 23.0, "w": 64.0, "h": 48}
 
 
 @pytest.fixture
@@ -48,8 +52,8 @@ def photos_of(monkeypatch):
     return set_size
 
 
-def write_json(path: Path, **content: object) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
+def transforms_of(folder: Path, **content: object) -> Path:
+    path = folder / "transforms.json"
     path.write_text(json.dumps(content), encoding="utf-8")
     return path
 
@@ -58,6 +62,126 @@ def pinhole_ring() -> Capture:
     """A capture that Blender's files hold, apart from its points."""
     capture = ring(Camera.pinhole(640, 480, 500.0))
     return replace(capture, points=np.zeros((0, 3)), colours=None, observations=None)
+
+
+def entry(file_path: str, **more: Any) -> dict[str, Any]:
+    return {"file_path": file_path, "transform_matrix": OPENGL_POSE, **more}
+
+
+def test_instant_ngp_file_with_shared_intrinsics_and_missing_images(tmp_path):
+    names = ["./images/a b.jpg", "images\\ü.jpg", "images/gone.jpg", "images/no_suffix"]
+    put_photos(tmp_path, "images/a b.jpg", "images/ü.jpg", "images/no_suffix.png")
+    content = {**SHARED, "k1": 0.1, "k2": -0.05, "p1": 0.001, "p2": 0.002, "aabb_scale": 4, "scale": 0.33}
+    path = transforms_of(tmp_path, **content, frames=[entry(name, sharpness=3.0) for name in names])
+    capture = load_scene(path)
+    assert capture.kind == "transforms"
+    assert [frame.name for frame in capture.frames] == ["images/a b.jpg", "images/ü.jpg", "images/no_suffix.png"]
+    assert all(frame.image is not None and frame.image.is_file() for frame in capture.frames)
+    assert capture.missing == ("images/gone.jpg",)
+    first = capture.frames[0]
+    assert first.camera == Camera("OPENCV", 64, 48, (50, 51, 33, 23, 0.1, -0.05, 0.001, 0.002))
+    np.testing.assert_allclose(first.world_from_cam, OPENCV_POSE, rtol=0, atol=1e-15)
+    assert capture.points.shape == (0, 3)
+
+
+def test_nerfstudio_file_with_intrinsics_and_masks_per_frame(tmp_path):
+    put_photos(tmp_path, "a.png", "b.png", "masks/a.png")
+    fisheye = {**SHARED, "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "camera_model": "OPENCV_FISHEYE"}
+    frames = [entry("a.png", mask_path="masks/a.png", **fisheye), entry("b.png", **SHARED, k3=0.3)]
+    path = transforms_of(tmp_path, frames=frames, train_filenames=["a.png"], test_filenames=["./b.png"])
+    first, second = load_scene(path).frames
+    assert first.camera == Camera("OPENCV_FISHEYE", 64, 48, (50, 51, 33, 23, 0.1, 0.2, 0.3, 0.4))
+    assert second.camera == Camera("FULL_OPENCV", 64, 48, (50, 51, 33, 23, 0, 0, 0, 0, 0.3, 0, 0, 0))
+    assert (first.mask, second.mask) == (tmp_path / "masks/a.png", None)
+    assert (first.split, second.split) == ("train", "test")
+
+
+@pytest.mark.parametrize(
+    ("intrinsics", "params"),
+    [
+        ({"camera_angle_x": 2 * np.arctan(0.5)}, (64, 64, 32, 24)),  # square pixels, size and centre of the image
+        ({"camera_angle_x": 2 * np.arctan(0.5), "camera_angle_y": 2 * np.arctan(0.25)}, (64, 96, 32, 24)),
+        ({"fl_y": 50.0}, (50, 50, 32, 24)),
+        ({"fl_x": 100.0, "w": 128, "h": 96}, (50, 50, 32, 24)),  # for twice the size that is on disk
+        ({"fl_x": 100.0, "cx": 60.0, "cy": 50.0, "w": 128, "h": 96}, (50, 50, 30, 25)),
+    ],
+)
+def test_focal_length_from_what_the_file_gives(tmp_path, intrinsics, params):
+    put_photos(tmp_path, "a.png")
+    path = transforms_of(tmp_path, **intrinsics, frames=[entry("a.png")])
+    camera = load_scene(path).frames[0].camera
+    assert (camera.model, camera.width, camera.height) == ("PINHOLE", 64, 48)
+    np.testing.assert_allclose(camera.params, params, rtol=1e-14)
+
+
+def test_rounded_poses_become_exactly_rigid(tmp_path):
+    put_photos(tmp_path, "a.png")
+    rounded = rigid.look_at(np.array([1.0, 2, 3]), np.zeros(3), np.array([0, 0, 1.0])).round(4)
+    path = transforms_of(tmp_path, **SHARED, frames=[entry("a", transform_matrix=rounded[:3].tolist())])
+    pose = load_scene(path).frames[0].world_from_cam
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(pose_in_axes(pose, "opengl"), rounded, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"frames": []}, "has no list of frames"),
+        ({"frames": [3]}, "has no list of frames"),
+        ({"frames": [{"file_path": "a.png"}]}, r"frames\[0\]: transform_matrix is missing"),
+        ({"frames": [entry("a.png", transform_matrix=[[1, 0], [0, 1]])]}, "transform_matrix is a list of 2"),
+        ({"frames": [entry("a.png", transform_matrix="no")]}, "transform_matrix is 'no'"),
+        ({"frames": [entry("a.png", transform_matrix=np.diag([1, 2, 1, 1]).tolist())]}, "is not a rotation"),
+        ({"frames": [entry("a.png", transform_matrix=np.diag([1, 1, -1, 1]).tolist())]}, "mirrors the scene"),
+        ({"frames": [entry("a.png", transform_matrix=np.full((4, 4), np.nan).tolist())]}, "not finite"),
+        ({"frames": [entry("a.png"), {"transform_matrix": OPENGL_POSE}]}, r"frames\[1\]: file_path is None"),
+        ({"frames": [entry("a.png"), entry("./a.png")]}, "'a.png' is listed twice"),
+        ({"frames": [entry("x.png"), entry("y.png")]}, r"none of its 2 photos is on disk, such as .*x\.png"),
+        ({"fl_x": "wide"}, "fl_x is 'wide'"),
+        ({"fl_x": -3}, "fl_x is -3.0"),
+        ({"fl_x": None, "fl_y": None}, "neither fl_x nor camera_angle_x"),
+        ({"fl_x": None, "camera_angle_x": 4.0}, "camera_angle_x is 4.0"),
+        ({"w": 63.5}, "w and h are 63.5"),
+        ({"w": 0}, "w and h are 0"),
+        ({"h": float("nan")}, "h is nan"),
+        ({"fl_x": float("nan")}, "fl_x is nan"),
+        ({"w": 48, "h": 64}, "64x48 pixels does not match a camera of 48x64"),
+        ({"camera_model": "PENTAGON"}, "camera_model 'PENTAGON' is not supported"),
+        ({"test_filenames": "a.png"}, "test_filenames is not a list"),
+    ],
+)
+def test_malformed_transforms_are_refused_with_file_and_field(tmp_path, change, what):
+    put_photos(tmp_path, "a.png")
+    path = transforms_of(tmp_path, **SHARED | {"frames": [entry("a.png")]} | change)
+    with pytest.raises(UserError, match=what) as caught:
+        load_scene(path)
+    assert caught.value.exit_code == BAD_INPUT
+    assert str(tmp_path) in caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("data", "what"),
+    [
+        (b'{"frames": [', "not valid JSON: Expecting value in line 1"),
+        (b"", "not valid JSON"),
+        (b"[1, 2]", "is a list of 2"),
+        (b"\xff\xfe\x00", "not UTF-8"),
+    ],
+)
+def test_what_is_no_json_object_is_refused(tmp_path, data, what):
+    path = tmp_path / "transforms.json"
+    path.write_bytes(data)
+    with pytest.raises(UserError, match=what):
+        parse_transforms(path)
+    with pytest.raises(UserError, match="No such file"):
+        parse_transforms(tmp_path / "none.json")
+
+
+def test_views_of_a_camera_path_need_no_photo(tmp_path):
+    view = entry("")
+    del view["file_path"]
+    path = transforms_of(tmp_path, fl_x=50, w=40, h=30, frames=[view, view])
+    assert [frame.name for frame in parse_transforms(path).frames] == ["frame_0000", "frame_0001"]
 
 
 @pytest.mark.parametrize("model", LOST)
@@ -111,17 +235,8 @@ def test_images_masks_splits_and_cameras_per_image(tmp_path):
 
 def test_poses_stay_in_the_files_world(tmp_path):
     applied = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 5.0], [0.0, -1.0, 0.0, 0.0]]
-    frames = [{"file_path": f"{i}.jpg", "transform_matrix": OPENGL_POSE, "sharpness": 3} for i in range(2)]
-    path = write_json(
-        tmp_path / "transforms.json",
-        fl_x=50,
-        w=64,
-        h=48,
-        applied_transform=applied,
-        aabb_scale=4,
-        offset=[0, 0, 0],
-        frames=frames,
-    )
+    frames = [entry("0.jpg"), entry("1.jpg")]
+    path = transforms_of(tmp_path, **SHARED, applied_transform=applied, offset=[0, 0, 0], frames=frames)
     capture = parse_transforms(path)
     np.testing.assert_array_equal(capture.frames[0].world_from_cam, OPENCV_POSE)
 
@@ -130,8 +245,7 @@ def test_names_and_sizes_without_the_photos(tmp_path, photos_of):
     """Suffixes come from the files on disk; a missing size is measured, or taken from the other photos."""
     photos_of(64, 48)
     entries = ["./images\\a b.jpg", "images/no_suffix", "images/gone", "/home/you/c.d/x.png"]
-    frames = [{"file_path": name, "transform_matrix": OPENGL_POSE} for name in entries]
-    path = write_json(tmp_path / "transforms.json", camera_angle_x=1.0, frames=frames)
+    path = transforms_of(tmp_path, camera_angle_x=1.0, frames=list(map(entry, entries)))
     with pytest.raises(UserError, match=r"frames\[0\]: w and h are missing, and .*images/a b.jpg does not exist"):
         parse_transforms(path)
     (tmp_path / "images").mkdir()
@@ -148,16 +262,15 @@ def test_names_and_sizes_without_the_photos(tmp_path, photos_of):
 
 
 def test_a_listed_cloud_that_is_missing_is_named(tmp_path):
-    frames = [{"file_path": "a.png", "transform_matrix": OPENGL_POSE}]
-    shared = {"fl_x": 50, "w": 64, "h": 48, "frames": frames}
-    path = write_json(tmp_path / "transforms.json", **shared, ply_file_path="sparse_pc.ply")
+    shared = {**SHARED, "frames": [entry("a.png")]}
+    path = transforms_of(tmp_path, **shared, ply_file_path="sparse_pc.ply")
     capture = parse_transforms(path)
     assert len(capture.points) == 0
     assert capture.notes == ("sparse_pc.ply, which transforms.json names, does not exist: no points are read",)
     with pytest.raises(UserError, match="ply_file_path is 3"):
-        parse_transforms(write_json(path, **shared, ply_file_path=3))
+        parse_transforms(transforms_of(tmp_path, **shared, ply_file_path=3))
     with pytest.raises(UserError, match="the lens model of ftheta_p0 is not supported"):
-        parse_transforms(write_json(path, **shared, ftheta_p0=0.1))
+        parse_transforms(transforms_of(tmp_path, **shared, ftheta_p0=0.1))
 
 
 def test_training_gets_the_points_beside_the_file(tmp_path):
