@@ -477,18 +477,6 @@ def refused_by_columns(folder: Path) -> None:
     assert "column by column" in caught.value.hint
 
 
-def test_numbers_as_text_and_names_of_models_in_any_case(tmp_path):
-    photos(tmp_path, numbered("{}.png"))
-    content = transforms_record(numbered("{}.png"), camera_model="opencv", k1=-0.05)
-    content |= {key: str(content[key]) for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    assert {frame.camera.model for frame in parsed(tmp_path).frames} == {"OPENCV"}
-    assert parsed(tmp_path).frames[0].camera.params[:4] == PINHOLE.params
-    (tmp_path / "transforms.json").write_text(json.dumps({**content, "fl_x": "wide"}))
-    with pytest.raises(UserError, match="fl_x is 'wide'"):
-        parsed(tmp_path)
-
-
 def written(folder: Path, **more: Any) -> dict[str, Any]:
     """Write photos; return a transforms.json of them, with further keys."""
     photos(folder, numbered("{}.png"))
@@ -498,6 +486,16 @@ def written(folder: Path, **more: Any) -> dict[str, Any]:
 def read_again(folder: Path, content: dict[str, Any]) -> Capture:
     (folder / "transforms.json").write_text(json.dumps(content))
     return parsed(folder)
+
+
+def test_numbers_as_text_and_names_of_models_in_any_case(tmp_path):
+    content = written(tmp_path, camera_model="opencv", k1=-0.05)
+    content |= {key: str(content[key]) for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
+    frames = read_again(tmp_path, content).frames
+    assert {frame.camera.model for frame in frames} == {"OPENCV"}
+    assert frames[0].camera.params[:4] == PINHOLE.params
+    with pytest.raises(UserError, match="fl_x is 'wide'"):
+        read_again(tmp_path, {**content, "fl_x": "wide"})
 
 
 def test_a_matrix_as_one_list_of_numbers_and_frames_without_one(tmp_path):
@@ -779,10 +777,8 @@ def test_terms_that_matter_are_refused_by_name(size, focal, terms, what):
 
 
 def test_a_fisheye_with_tangential_terms_is_a_thin_prism_fisheye(tmp_path):
-    photos(tmp_path, numbered("{}.png"))
-    more = {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "p1": 0.001, "p2": -0.002}
-    (tmp_path / "transforms.json").write_text(json.dumps(transforms_record(numbered("{}.png"), **more)))
-    camera = parsed(tmp_path).frames[0].camera
+    content = written(tmp_path, camera_model="OPENCV_FISHEYE", k1=0.02, p1=0.001, p2=-0.002)
+    camera = read_again(tmp_path, content).frames[0].camera
     assert camera == Camera("THIN_PRISM_FISHEYE", *SIZE, (*PINHOLE.params, 0.02, 0, 0.001, -0.002, 0, 0, 0, 0))
 
 
@@ -790,13 +786,11 @@ def test_a_fisheye_with_tangential_terms_is_a_thin_prism_fisheye(tmp_path):
 
 
 def test_masks_that_are_missing_are_left_out_and_named(tmp_path):
-    photos(tmp_path, numbered("{}.png"))
+    content = written(tmp_path)
     photos(tmp_path, ["masks/0.png"])
-    content = transforms_record(numbered("{}.png"))
     for frame, mask in zip(content["frames"], ("C:\\x\\masks\\0.png", "masks/1.png", "", None), strict=False):
         frame["mask_path"] = mask
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    capture = parsed(tmp_path)
+    capture = read_again(tmp_path, content)
     assert [frame.mask for frame in capture.frames] == [tmp_path / "masks/0.png", *[None] * (COUNT - 1)]
     assert capture.notes == ("1 mask named in transforms.json left out, not found: masks/1.png",)
 
