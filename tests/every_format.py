@@ -16,7 +16,8 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.registry import format_named
+from nerfcli.captures.formats.format import UserInputs
+from nerfcli.captures.formats.registry import format_named, recognise
 from nerfcli.captures.formats.run_cameras import write_cameras
 
 OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -62,6 +63,12 @@ class Views:
         return [Frame(n, self.camera, p, image=i) for n, p, i in zip(names, self.poses, images, strict=True)]
 
 
+def parse(place: Path, given: UserInputs = UserInputs()) -> Capture:
+    """Read the capture in a file or folder, in any format."""
+    form, found = recognise(place)
+    return form.parse(found, given)
+
+
 def numbers(values: np.ndarray) -> str:
     return " ".join(map(repr, np.ravel(values).tolist()))
 
@@ -72,6 +79,12 @@ def matrix_text(matrix: np.ndarray) -> str:
 
 def change_json(path: Path, **change: Any) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
+
+
+def replace_in(path: Path, old: str, new: str) -> None:
+    content = path.read_text(encoding="utf-8")
+    assert old in content
+    path.write_text(content.replace(old, new), encoding="utf-8")
 
 
 def text(path: Path, content: str) -> Path:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from every_format import WITH_PHOTOS, Views
+from every_format import WITH_PHOTOS, Views, parse
 from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
@@ -84,10 +84,10 @@ def test_photos_in_another_folder_are_given(name, tmp_path, monkeypatch):
     for photo in [path for path in (tmp_path / "capture").rglob("*") if path.suffix in (".jpg", ".png")]:
         if photo.parent.name != "mask":
             photo.rename(tmp_path / "elsewhere" / photo.name)
-    form, found = recognise(file if name == "run" else tmp_path / "capture")
+    source = file if name == "run" else tmp_path / "capture"
     monkeypatch.chdir(tmp_path)
     for images in (tmp_path / "elsewhere", Path("elsewhere")):
-        frames = form.parse(found, UserInputs(images=images)).frames
+        frames = parse(source, UserInputs(images=images)).frames
         assert len(frames) == len(POSES)
         assert all(frame.has_photo for frame in frames)
         assert {frame.image.absolute().parent for frame in frames if frame.image} == {tmp_path / "elsewhere"}

@@ -5,12 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from every_format import WITH_PHOTOS, Views, change_json, matrix_text, text
+from every_format import WITH_PHOTOS, Views, change_json, matrix_text, parse, text
 from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.errors import BAD_INPUT, UserError
@@ -32,11 +31,6 @@ def photo(path: Path) -> None:
     VIEWS.put(0, path)
 
 
-def parse(folder: Path, given: UserInputs = UserInputs()) -> tuple[str, Capture]:
-    form, found = recognise(folder)
-    return form.name, form.parse(found, given)
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_a_missing_photo_is_listed(tmp_path, name):
     write(name, tmp_path)
@@ -46,7 +40,7 @@ def test_a_missing_photo_is_listed(tmp_path, name):
         with pytest.raises(UserError, match="has 3 cameras, but there are 2 photos"):
             parse(tmp_path)
     else:
-        _, capture = parse(tmp_path)
+        capture = parse(tmp_path)
         assert capture.missing == (photos[0].stem,)
         np.testing.assert_allclose(capture.frames[0].world_from_cam, POSES[1], rtol=0, atol=1e-13)
 
@@ -68,9 +62,9 @@ OTHER_NAMES = [
 @pytest.mark.parametrize(("name", "usual", "other"), OTHER_NAMES)
 def test_other_names_of_folders_and_files_give_the_same_capture(tmp_path, name, usual, other):
     write(name, tmp_path)
-    expected = parse(tmp_path)[1]
+    expected = parse(tmp_path)
     (tmp_path / usual).rename(tmp_path / other)
-    found = parse(tmp_path)[1]
+    found = parse(tmp_path)
     assert [frame.name for frame in found.frames] == [frame.name for frame in expected.frames]
     for frame, usual_frame in zip(found.frames, expected.frames, strict=True):
         np.testing.assert_array_equal(frame.world_from_cam, usual_frame.world_from_cam)
@@ -96,7 +90,7 @@ class TestPoseFiles:
             parse(tmp_path)
         assert "--intrinsics" in caught.value.hint
         twice = CAMERA.resized(2 * SIZE[0], 2 * SIZE[1])
-        _, capture = parse(tmp_path, UserInputs(camera=twice))
+        capture = parse(tmp_path, UserInputs(camera=twice))
         assert [frame.name for frame in capture.frames] == [f"frame-{index:06d}.color.png" for index in range(3)]
         np.testing.assert_allclose([frame.world_from_cam for frame in capture.frames], POSES, rtol=0, atol=1e-13)
         assert {frame.camera for frame in capture.frames} == {CAMERA}
@@ -106,7 +100,7 @@ class TestPoseFiles:
         photo(tmp_path / "color/10.jpg")
         text(tmp_path / "pose/10.txt", matrix_text(POSES[0]))
         text(tmp_path / "pose/1.txt", "-inf " * 12 + "0 0 0 1")
-        _, capture = parse(tmp_path)
+        capture = parse(tmp_path)
         assert [frame.name for frame in capture.frames] == ["0.jpg", "2.jpg", "10.jpg"]
         assert capture.missing == ()
 
@@ -115,12 +109,12 @@ class TestPoseFiles:
             photo(tmp_path / f"rgb/{split}_a_0000.png")
             text(tmp_path / f"pose/{split}_a_0000.txt", " ".join(map(repr, pose.ravel().tolist())))
         text(tmp_path / "intrinsics.txt", "140 60.5 51 0.\n0. 0. 0.\n1.\n96 128\n")
-        _, capture = parse(tmp_path)
+        capture = parse(tmp_path)
         assert [frame.split for frame in capture.frames] == ["train", "val", "test"]
         assert {frame.camera for frame in capture.frames} == {Camera("PINHOLE", 64, 48, (70.0, 70.0, 30.25, 25.5))}
         photo(tmp_path / "rgb/more.png")
         text(tmp_path / "pose/more.txt", matrix_text(POSES[0]))
-        assert {frame.split for frame in parse(tmp_path)[1].frames} == {None}
+        assert {frame.split for frame in parse(tmp_path).frames} == {None}
 
     @pytest.mark.parametrize(
         ("content", "what"),
@@ -151,7 +145,7 @@ class TestMvsnet:
         write("mvsnet", tmp_path)
         for path in (tmp_path / "cams").iterdir():
             path.write_text(path.read_text().replace("2.5 0.01", depths))
-        found = parse(tmp_path)[1].depth_bounds
+        found = parse(tmp_path).depth_bounds
         if bounds is None:
             assert found is None
         else:
@@ -161,22 +155,22 @@ class TestMvsnet:
 class TestNeus:
     def test_masks_belong_to_photos_in_order(self, tmp_path):
         write("neus", tmp_path)
-        masks = [frame.mask for frame in parse(tmp_path)[1].frames]
+        masks = [frame.mask for frame in parse(tmp_path).frames]
         assert masks == [tmp_path / f"mask/{index:03d}.png" for index in range(3)]
         (tmp_path / "mask/001.png").unlink()
-        assert {frame.mask for frame in parse(tmp_path)[1].frames} == {None}
+        assert {frame.mask for frame in parse(tmp_path).frames} == {None}
 
     def test_one_camera_rounded_to_float32_stays_one(self, tmp_path):
         path = write("neus", tmp_path)
         with np.load(path) as arrays:
             rounded = {name: array.astype(np.float32) for name, array in arrays.items()}
         np.savez(path, **rounded)
-        _, capture = parse(tmp_path)
+        capture = parse(tmp_path)
         assert len({frame.camera for frame in capture.frames}) == 1
         np.testing.assert_allclose(capture.frames[0].camera.params, CAMERA.params, rtol=1e-5)
         rounded["world_mat_1"] = np.diag([1.01, 1, 1, 1]) @ rounded["world_mat_1"]
         np.savez(path, **rounded)
-        assert len({frame.camera for frame in parse(tmp_path)[1].frames}) == 3
+        assert len({frame.camera for frame in parse(tmp_path).frames}) == 3
 
     def test_a_projection_of_no_camera_is_refused(self, tmp_path):
         path = write("neus", tmp_path)
@@ -200,7 +194,7 @@ class TestPolycam:
             (tmp_path / f"keyframes/corrected_{name}").rename(tmp_path / f"keyframes/{name}")
         if corrected_cameras:
             text(tmp_path / "keyframes/corrected_cameras/1000.json", "{}")
-        _, capture = parse(tmp_path / "keyframes")
+        capture = parse(tmp_path / "keyframes")
         np.testing.assert_allclose([frame.world_from_cam for frame in capture.frames], POSES, rtol=0, atol=1e-13)
 
 
@@ -208,7 +202,7 @@ class TestRecord3d:
     def test_the_focus_may_move(self, tmp_path):
         rows = [[70.0 + index, 71.5, 30.25, 25.5] for index in range(len(POSES))]
         change_json(write("record3d", tmp_path), perFrameIntrinsicCoeffs=rows)
-        assert [frame.camera.params for frame in parse(tmp_path)[1].frames] == [tuple(row) for row in rows]
+        assert [frame.camera.params for frame in parse(tmp_path).frames] == [tuple(row) for row in rows]
 
     @pytest.mark.parametrize(
         ("change", "what"),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from clips import encode
-from every_format import OPENGL, WITH_PHOTOS, Views, change_json, numbers, text
+from every_format import OPENGL, WITH_PHOTOS, Views, change_json, numbers, parse, replace_in, text
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
@@ -28,17 +28,6 @@ CAMERA = Camera("PINHOLE", *SIZE, (FOCAL, FOCAL, *CENTRE))
 PLACES = np.array([[3.0, -4.0, 0.0], [0.0, 4.0, 3.0]])
 POSES = np.stack([rigid.look_at(place, np.zeros(3), np.array([0.0, 0.0, 1.0])) for place in PLACES])
 VIEWS = Views(CAMERA, POSES)
-
-
-def parse(place: Path, given: UserInputs = UserInputs()) -> Capture:
-    form, found = recognise(place)
-    return form.parse(found, given)
-
-
-def replace_in(path: Path, old: str, new: str) -> None:
-    content = path.read_text()
-    assert old in content
-    path.write_text(content.replace(old, new))
 
 
 def pixels(capture: Capture, points: np.ndarray) -> np.ndarray:

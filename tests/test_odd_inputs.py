@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from captures import ring
 from commands import error_of, nerfcli
-from every_format import WITH_PHOTOS, Views, numbers
+from every_format import WITH_PHOTOS, Views, numbers, parse, replace_in
 from PIL import Image
 from views import PINHOLE, capture_of
 
@@ -27,11 +27,10 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.captures.axes import pose_in_axes
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import write_colmap_binary, write_colmap_text
-from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.lenses import Fits, Terms
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.formats.ply import write_points
-from nerfcli.captures.formats.registry import recognise, with_masks
+from nerfcli.captures.formats.registry import with_masks
 from nerfcli.errors import BAD_INPUT, UserError
 
 CAPTURE = capture_of([PINHOLE])
@@ -76,11 +75,6 @@ def transforms(folder: Path, names: Sequence[str]) -> None:
     (folder / "transforms.json").write_text(json.dumps(transforms_record(names)))
 
 
-def parsed(folder: Path, **given: Any) -> Capture:
-    form, found = recognise(folder)
-    return form.parse(found, UserInputs(**given))
-
-
 def numbered(pattern: str) -> list[str]:
     return [pattern.format(index) for index in range(COUNT)]
 
@@ -120,7 +114,7 @@ def numbered(pattern: str) -> list[str]:
 def test_photos_under_other_names_are_found_and_said_once(write, on_disk, listed, note, tmp_path):
     photos(tmp_path, numbered(on_disk))
     write(tmp_path, numbered(listed))
-    capture = parsed(tmp_path)
+    capture = parse(tmp_path)
     assert levels([frame.image for frame in capture.frames]) == list(range(COUNT))
     np.testing.assert_allclose([f.centre for f in capture.frames], [f.centre for f in CAPTURE.frames], atol=1e-12)
     if note is None and not (write is transforms and "left" in listed):
@@ -332,12 +326,6 @@ def assert_centres(capture: Capture, expected: np.ndarray) -> None:
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-12)
 
 
-def edited(path: Path, old: str, new: str) -> None:
-    content = path.read_text(encoding="utf-8")
-    assert old in content
-    path.write_text(content.replace(old, new, 1), encoding="utf-8")
-
-
 def lose_record3d(folder: Path) -> None:
     content = json.loads((folder / "metadata.json").read_text())
     content["poses"][LOST][:4] = [0.0] * 4
@@ -407,7 +395,7 @@ def test_a_frame_without_a_pose_is_left_out_and_named(form, tmp_path):
         LOSE[form](put(form, tmp_path))
     else:
         put(form, tmp_path, changed(np.full((3, 3), np.nan), LOST))
-    capture = parsed(tmp_path)
+    capture = parse(tmp_path)
     assert_centres(capture, np.delete(POSES[:, :3, 3], LOST, axis=0))
     assert len(capture.notes) == 1
     assert "1 of 8 frames left out: " in capture.notes[0]
@@ -420,7 +408,7 @@ def test_a_capture_whose_only_photo_has_no_pose_is_refused(tmp_path):
         if photo.stem != str(LOST):
             photo.unlink()
     with pytest.raises(UserError, match="lists no images with a pose"):
-        parsed(tmp_path)
+        parse(tmp_path)
 
 
 @pytest.mark.parametrize("form", ["mvsnet", "polycam", "pose-files"])
@@ -428,13 +416,13 @@ def test_a_capture_whose_only_photo_has_no_pose_is_refused(tmp_path):
 def test_too_few_poses_are_refused_with_the_reason(form, count, tmp_path):
     put(form, tmp_path, changed(np.full((3, 3), np.nan), *range(count)))
     with pytest.raises(UserError, match=f"not finite|nan.*; only {8 - count} of 8 frames can be used"):
-        parsed(tmp_path)
+        parse(tmp_path)
 
 
 @pytest.mark.parametrize("form", OF_MATRICES)
 def test_evenly_scaled_rotations_are_normalised_and_said(form, tmp_path):
     put(form, tmp_path, changed(0.33 * np.eye(3)))
-    capture = parsed(tmp_path)
+    capture = parse(tmp_path)
     assert_centres(capture, POSES[:, :3, 3])
     scale = "3.03" if form == "mvsnet" else "0.33"  # its files hold the inverse
     assert capture.notes == (f"the rotations of 8 frames are scaled by {scale}: normalised",)
@@ -447,7 +435,7 @@ def test_evenly_scaled_rotations_are_normalised_and_said(form, tmp_path):
 def test_uneven_scale_and_mirrors_stay_refused(form, block, what, tmp_path):
     put(form, tmp_path, changed(np.diag(block)))
     with pytest.raises(UserError, match=what):
-        parsed(tmp_path)
+        parse(tmp_path)
 
 
 @pytest.mark.parametrize("form", ["metashape", "mvsnet", "pose-files", "3d-scanner-app", "transforms"])
@@ -467,13 +455,13 @@ def test_matrices_that_are_stored_column_by_column_are_refused(form, tmp_path):
 def test_a_camera_on_a_body_that_is_stored_column_by_column_is_refused(tmp_path):
     put("euroc", tmp_path)
     row = np.array([[0.0, -1, 0, 0.1], [1, 0, 0, -0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]])
-    edited(tmp_path / "mav0/cam0/sensor.yaml", numbers(row), numbers(row.T))
+    replace_in(tmp_path / "mav0/cam0/sensor.yaml", numbers(row), numbers(row.T))
     refused_by_columns(tmp_path)
 
 
 def refused_by_columns(folder: Path) -> None:
     with pytest.raises(UserError, match=r"last row is .*, expected 0 0 0 1") as caught:
-        parsed(folder)
+        parse(folder)
     assert "column by column" in caught.value.hint
 
 
@@ -485,7 +473,7 @@ def written(folder: Path, **more: Any) -> dict[str, Any]:
 
 def read_again(folder: Path, content: dict[str, Any]) -> Capture:
     (folder / "transforms.json").write_text(json.dumps(content))
-    return parsed(folder)
+    return parse(folder)
 
 
 def test_numbers_as_text_and_names_of_models_in_any_case(tmp_path):
@@ -595,7 +583,7 @@ def test_of_several_models_the_largest_is_read_and_the_others_are_counted(end, t
         write_colmap_text(own, tmp_path / "sparse" / number)
         for path in (tmp_path / "sparse" / number).iterdir():
             path.write_bytes(("\ufeff" + path.read_text().replace("\n", end)).encode())
-    capture = parsed(tmp_path)
+    capture = parse(tmp_path)
     assert [frame.name for frame in capture.frames] == numbered("{}.png")[2:]
     assert capture.notes == (
         "sparse/1 with 4 photos is read; other models, which are in other coordinates: sparse/0 with 2, sparse/10 "
@@ -610,7 +598,7 @@ def test_a_model_without_its_points_keeps_its_poses(lost, tmp_path):
     write = write_colmap_text if lost.endswith(".txt") else write_colmap_binary
     write(replace(CAPTURE, frames=named), tmp_path / "sparse/0")
     (tmp_path / "sparse/0" / lost).unlink()
-    capture = parsed(tmp_path)
+    capture = parse(tmp_path)
     np.testing.assert_allclose([f.centre for f in capture.frames], [f.centre for f in CAPTURE.frames], atol=1e-12)
     assert len(capture.points) == 0
     assert capture.notes == (f"{tmp_path / 'sparse/0' / lost} does not exist: no points are read",)
@@ -625,7 +613,7 @@ def test_lines_of_features_that_were_left_out_by_hand(between, tmp_path):
     path = tmp_path / "sparse/0/images.txt"
     listed = [line for line in path.read_text().splitlines() if line.endswith(".png")]
     path.write_text("# by hand\n" + between.join(listed) + "\n")
-    capture = parsed(tmp_path)
+    capture = parse(tmp_path)
     assert [frame.name for frame in capture.frames] == names
     np.testing.assert_allclose([f.centre for f in capture.frames], [f.centre for f in CAPTURE.frames], atol=1e-12)
     assert len(capture.points) == len(CAPTURE.points)
@@ -643,13 +631,13 @@ def test_whole_numbers_with_decimals_tabs_and_indented_comments(tmp_path):
         row[0], row[8] = f"{row[0]}.000e+00", f"{row[8]}.0"
     images.write_text("  # by hand\n" + "\n".join(map("\t".join, rows)))
     points.write_text(" # by hand\n" + points.read_text())
-    capture = parsed(tmp_path)
+    capture = parse(tmp_path)
     np.testing.assert_allclose([f.centre for f in capture.frames], [f.centre for f in CAPTURE.frames], atol=1e-12)
     assert {frame.camera for frame in capture.frames} == {PINHOLE}
     assert len(capture.points) == len(CAPTURE.points)
     cameras.write_text(f"1 PINHOLE 640.5 480 {' '.join(params)}\n")
     with pytest.raises(UserError, match=r"cameras\.txt is damaged: 640\.5 is not a whole number"):
-        parsed(tmp_path)
+        parse(tmp_path)
 
 
 def test_names_in_a_code_page_of_windows_are_refused_with_what_to_do(tmp_path):
@@ -657,7 +645,7 @@ def test_names_in_a_code_page_of_windows_are_refused_with_what_to_do(tmp_path):
     path = tmp_path / "sparse/0/images.bin"
     path.write_bytes(path.read_bytes().replace(b"2.jpg", "照2".encode("gbk") + b"jp"))
     with pytest.raises(UserError, match=r"images\.bin: the name of a photo is not in UTF-8 \(byte 0xd5\)") as caught:
-        parsed(tmp_path)
+        parse(tmp_path)
     assert "rename the photos to plain letters" in caught.value.hint
 
 
@@ -669,7 +657,7 @@ def test_the_undistorted_copy_in_a_workspace_of_colmap_is_found(folder, tmp_path
     for path in (tmp_path / folder / "sparse/0").iterdir():
         path.rename(path.parents[1] / path.name)
     (tmp_path / folder / "sparse/0").rmdir()
-    capture = parsed(tmp_path)
+    capture = parse(tmp_path)
     images = [tmp_path / folder / "images" / name for name in numbered("{}.png")]
     assert [frame.image for frame in capture.frames] == images
     assert capture.notes == ()
@@ -680,10 +668,10 @@ def test_the_undistorted_copy_in_a_workspace_of_colmap_is_found(folder, tmp_path
 def test_files_that_powershell_has_written(order, form, tmp_path):
     """Its > writes UTF-16 with a byte order mark and CRLF."""
     put(form, tmp_path)
-    before = parsed(tmp_path)
+    before = parse(tmp_path)
     for path in (path for path in tmp_path.rglob("*") if path.suffix in (".txt", ".json", ".csv")):
         path.write_bytes(("\ufeff" + path.read_text(encoding="utf-8").replace("\n", "\r\n")).encode(order))
-    after = parsed(tmp_path)
+    after = parse(tmp_path)
     np.testing.assert_array_equal([f.world_from_cam for f in after.frames], [f.world_from_cam for f in before.frames])
     np.testing.assert_array_equal(after.points, before.points)
 
@@ -691,7 +679,7 @@ def test_files_that_powershell_has_written(order, form, tmp_path):
 def test_a_name_that_no_file_can_have_is_a_missing_photo(tmp_path):
     photos(tmp_path, numbered("{}.png")[1:])
     transforms(tmp_path, ["x" * 300 + ".png", *numbered("{}.png")[1:]])
-    assert [frame.has_photo for frame in parsed(tmp_path).frames] == [False, *[True] * (COUNT - 1)]
+    assert [frame.has_photo for frame in parse(tmp_path).frames] == [False, *[True] * (COUNT - 1)]
 
 
 def test_a_lens_of_a_later_colmap_is_named_with_what_supports_it(tmp_path):
@@ -701,7 +689,7 @@ def test_a_lens_of_a_later_colmap_is_named_with_what_supports_it(tmp_path):
     with pytest.raises(
         UserError, match=r"cameras\.bin: camera 1 has the camera model 31, which COLMAP .* lacks"
     ) as caught:
-        parsed(tmp_path)
+        parse(tmp_path)
     assert "EQUIRECTANGULAR" in caught.value.hint
 
 
@@ -715,7 +703,7 @@ def test_a_sphere_that_is_not_two_to_one_is_refused(form, tmp_path):
         colmap(tmp_path, numbered("{}.png"))
         (tmp_path / "sparse/0/cameras.txt").write_text("1 EQUIRECTANGULAR 640 480 640 480\n")
     with pytest.raises(UserError, match="EQUIRECTANGULAR picture: 640x480") as caught:
-        parsed(tmp_path)
+        parse(tmp_path)
     assert "twice as wide as high" in caught.value.hint
 
 
@@ -809,7 +797,7 @@ def test_masks_that_are_named_after_the_photo_are_found(on_disk, tmp_path):
 def test_masks_are_found_by_the_photos_as_they_are_on_disk(tmp_path):
     photos(tmp_path, [*numbered("images/my view {}.png"), "masks/my view 1.png"])
     transforms(tmp_path, numbered("images/my%20view%20{}.png"))
-    capture = with_masks(parsed(tmp_path), tmp_path / "masks")
+    capture = with_masks(parse(tmp_path), tmp_path / "masks")
     assert [frame.mask for frame in capture.frames] == [None, tmp_path / "masks/my view 1.png", *[None] * (COUNT - 2)]
 
 
@@ -817,7 +805,7 @@ def test_masks_of_photos_of_one_name_are_found_by_their_folders_on_disk(tmp_path
     sides = ("left/my view.png", "right/my view.png")
     photos(tmp_path, [*(f"{folder}/{name}" for folder in ("images", "masks") for name in sides), "masks/my view.png"])
     transforms(tmp_path, [f"images/{name.replace(' ', '%20')}" for name in sides])
-    capture = with_masks(parsed(tmp_path), tmp_path / "masks")
+    capture = with_masks(parse(tmp_path), tmp_path / "masks")
     assert [frame.mask for frame in capture.frames] == [tmp_path / "masks" / name for name in sides]
 
 
@@ -849,9 +837,9 @@ def test_equal_labels_of_metashape_are_told_apart_by_their_groups(tmp_path):
     put("metashape", tmp_path)
     path = tmp_path / "cameras.xml"
     photos(tmp_path / "images", ["left/0.jpg", "right/0.jpg"], size=CAMERA.size)
-    edited(path, 'label="1"', 'label="0"')
+    replace_in(path, 'label="1"', 'label="0"')
     with pytest.raises(UserError, match="'0' is listed twice"):
-        parsed(path)
+        parse(path)
     tree = ElementTree.parse(path)
     cameras = tree.find("chunk/cameras")
     assert cameras is not None
@@ -860,7 +848,7 @@ def test_equal_labels_of_metashape_are_told_apart_by_their_groups(tmp_path):
         ElementTree.SubElement(cameras, "group", label=side).append(camera)
     next(iter(cameras)).attrib.pop("label")
     tree.write(path)
-    capture = parsed(path)
+    capture = parse(path)
     images = {frame.name: frame.image for frame in capture.frames}
     assert images["left/0"] == tmp_path / "images/left/0.jpg"
     assert images["right/0"] == tmp_path / "images/right/0.jpg"
@@ -876,9 +864,9 @@ def test_keyframes_of_polycam_whose_corrected_cameras_lack_their_size(tmp_path):
         content = json.loads(path.read_text())
         del content["width"], content["height"]
         path.write_text(json.dumps(content))
-    capture = parsed(tmp_path)
+    capture = parse(tmp_path)
     assert_centres(capture, POSES[:, :3, 3])
     assert {frame.camera.size for frame in capture.frames} == {CAMERA.size}
     assert capture.notes == ()
     (home / "corrected_cameras/1002.json").unlink()
-    assert parsed(tmp_path).notes == ("1 of 8 keyframes left out, whose poses Polycam has not corrected",)
+    assert parse(tmp_path).notes == ("1 of 8 keyframes left out, whose poses Polycam has not corrected",)
