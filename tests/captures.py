@@ -77,11 +77,13 @@ def photograph(frames: Sequence[Frame]) -> None:
         Image.new("L", frame.camera.size).save(frame.image)
 
 
-def put_photos(folder: Path, *names: str) -> None:
-    """Put pictures of 64 x 48 pixels into a folder."""
+def put_photos(folder: Path, *names: str, size: tuple[int, int] = (64, 48), orientation: int = 1) -> None:
+    """Put pictures of a size as it is stored and of an EXIF orientation into a folder."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
     for path in (folder / name for name in names):
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.new("L", (64, 48)).save(path)
+        Image.new("L", size).save(path, exif=exif)
 
 
 def with_photos(capture: Capture, folder: Path) -> Capture:

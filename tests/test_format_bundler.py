@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from captures import put_photos
 from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
@@ -12,18 +13,11 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.bundler import find_bundler, parse_bundler
 from nerfcli.captures.formats.format import UserInputs
-from nerfcli.captures.orientation import Picture
 from nerfcli.errors import BAD_INPUT, UserError
 
 LENSES = [(60.0, 0.1, -0.05), (55.0, 0.02, 0.0), (50.0, 0.0, 0.0)]
 NAMES = ["a.jpg", "b c.jpg", "ü.jpg"]
 POINTS = np.random.default_rng(5).uniform(-1, 1, (7, 3))
-SIZE = (64, 48)
-
-
-@pytest.fixture(autouse=True)
-def _photos_of_one_size(monkeypatch):
-    monkeypatch.setattr("nerfcli.captures.orientation.measure", lambda path: Picture(path, *SIZE, 1))
 
 
 def bundler_cameras() -> list[tuple[np.ndarray, np.ndarray]]:
@@ -58,8 +52,7 @@ def model_text() -> str:
 
 
 def write(folder: Path, text: str, names: list[str] = NAMES, *, on_disk: list[str] = NAMES) -> Path:
-    for name in on_disk:
-        (folder / name).write_bytes(b"")
+    put_photos(folder, *on_disk)
     (folder / "list.txt").write_text("\n".join(names) + "\n", encoding="utf-8")
     (folder / "bundle").mkdir(exist_ok=True)
     path = folder / "bundle" / "bundle.out"

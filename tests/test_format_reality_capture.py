@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from captures import put_photos
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.reality_capture import parse_reality_capture
-from nerfcli.captures.orientation import Picture
 from nerfcli.errors import BAD_INPUT, UserError
 
 OLD = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"
@@ -28,16 +28,6 @@ LENS = {
 SIZES = {"wide": (64, 48), "tall": (48, 64)}
 
 
-@pytest.fixture(autouse=True)
-def _sizes_by_name(monkeypatch):
-    """The name gives the size; on.jpg is stored sideways and shown upright."""
-
-    def measure(path: Path) -> Picture:
-        return Picture(path, 48, 64, 6) if path.stem == "on" else Picture(path, *SIZES.get(path.stem, (64, 48)), 1)
-
-    monkeypatch.setattr("nerfcli.captures.orientation.measure", measure)
-
-
 def row(name: str, pose: tuple[float, ...] = (1, 2, 3, 0, 0, 0), lens: dict[str, float] | None = None) -> str:
     return ",".join([name, *map(repr, (*pose, *(lens or LENS).values()))])
 
@@ -46,12 +36,6 @@ def write(folder: Path, *rows: str, header: str = OLD) -> Path:
     path = folder / "cameras.csv"
     path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
     return path
-
-
-def touch(folder: Path, *names: str) -> None:
-    for name in names:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(b"")
 
 
 def world_from_opengl(heading: float, pitch: float, roll: float) -> np.ndarray:
@@ -85,7 +69,8 @@ def opencv_pixels(lens: dict[str, float], size: tuple[int, int], points: np.ndar
 def test_both_programs_tables_project_as_their_exports_for_opencv(tmp_path, header):
     rng = np.random.default_rng(0)
     poses = [tuple(rng.uniform(-180, 180, 6).tolist()) for _ in range(2)]
-    touch(tmp_path, "wide.jpg", "tall.jpg")
+    for name, size in SIZES.items():
+        put_photos(tmp_path, f"{name}.jpg", size=size)
     path = write(tmp_path, *(row(f"{name}.jpg", pose) for name, pose in zip(SIZES, poses, strict=True)), header=header)
     capture = parse_reality_capture(path)
     in_cam = np.column_stack([rng.uniform(-0.5, 0.5, (100, 2)), np.ones(100)]) * rng.uniform(1, 9, (100, 1))
@@ -107,7 +92,7 @@ def test_both_programs_tables_project_as_their_exports_for_opencv(tmp_path, head
     ],
 )
 def test_angles_by_hand(tmp_path, angles, view, up):
-    touch(tmp_path, "a.jpg")
+    put_photos(tmp_path, "a.jpg")
     frame = parse_reality_capture(write(tmp_path, row("a.jpg", (1, 2, 3, *angles)))).frames[0]
     np.testing.assert_array_equal(frame.centre, [1, 2, 3])
     np.testing.assert_allclose(frame.world_from_cam[:3, 2], view, rtol=0, atol=1e-15)
@@ -116,7 +101,8 @@ def test_angles_by_hand(tmp_path, angles, view, up):
 
 def test_names_photos_and_a_line_before_the_header(tmp_path):
     images = tmp_path / "photos"
-    touch(images, "b c.jpg", "ü, 2.jpg", "on.jpg")
+    put_photos(images, "b c.jpg", "ü, 2.jpg")
+    put_photos(images, "on.jpg", orientation=6)
     plain = {**dict.fromkeys(LENS, 0), "f": 36.0}
     rows = (row("b c.jpg", lens=plain), row('"ü, 2.jpg"', lens=plain), row("gone.jpg"), row("on.jpg", lens=plain), "")
     capture = parse_reality_capture(write(tmp_path, *rows, header=f"#cameras 4\n{OLD}"), UserInputs(images))
@@ -149,7 +135,7 @@ def test_names_photos_and_a_line_before_the_header(tmp_path):
     ],
 )
 def test_malformed_files_are_refused_with_file_and_line(tmp_path, rows, header, what):
-    touch(tmp_path, "a.jpg", "b.jpg")
+    put_photos(tmp_path, "a.jpg", "b.jpg")
     path = write(tmp_path, *rows, header=header)
     with pytest.raises(UserError, match=what) as caught:
         parse_reality_capture(path)

@@ -23,7 +23,6 @@ from nerfcli.captures.formats.transforms import (
 )
 from nerfcli.captures.formats.transforms_cameras import lost_to_transforms
 from nerfcli.captures.loading import load_scene
-from nerfcli.captures.orientation import Picture
 from nerfcli.errors import BAD_INPUT, UserError
 
 LOST = {
@@ -40,16 +39,6 @@ LOST = {
 OPENGL_POSE = [[0.0, 0.0, 1.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
 OPENCV_POSE = [[0.0, 0.0, -1.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, -1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
 SHARED = {"fl_x": 50.0, "fl_y": 51.0, "cx": 33.0, "cy": 23.0, "w": 64.0, "h": 48}
-
-
-@pytest.fixture
-def photos_of(monkeypatch):
-    """Return a function that makes every file of a photo count as one of this size."""
-
-    def set_size(width: int, height: int) -> None:
-        monkeypatch.setattr("nerfcli.captures.orientation.measure", lambda path: Picture(path, width, height, 1))
-
-    return set_size
 
 
 def transforms_of(folder: Path, **content: object) -> Path:
@@ -241,15 +230,13 @@ def test_poses_stay_in_the_files_world(tmp_path):
     np.testing.assert_array_equal(capture.frames[0].world_from_cam, OPENCV_POSE)
 
 
-def test_names_and_sizes_without_the_photos(tmp_path, photos_of):
+def test_names_and_sizes_without_the_photos(tmp_path):
     """Suffixes come from the files on disk; a missing size is measured, or taken from the other photos."""
-    photos_of(64, 48)
     entries = ["./images\\a b.jpg", "images/no_suffix", "images/gone", "/home/you/c.d/x.png"]
     path = transforms_of(tmp_path, camera_angle_x=1.0, frames=list(map(entry, entries)))
     with pytest.raises(UserError, match=r"frames\[0\]: w and h are missing, and .*images/a b.jpg does not exist"):
         parse_transforms(path)
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images/no_suffix.JPG").write_bytes(b"")
+    put_photos(tmp_path, "images/no_suffix.JPG")
     capture = parse_transforms(path)
     assert [frame.name for frame in capture.frames] == [
         "images/a b.jpg",
@@ -280,23 +267,19 @@ def test_training_gets_the_points_beside_the_file(tmp_path):
     np.testing.assert_array_equal(load_scene(tmp_path).points, capture.points)
 
 
-def test_images_of_blender_files_in_another_folder(tmp_path, photos_of):
-    photos_of(64, 48)
+def test_images_of_blender_files_in_another_folder(tmp_path):
     capture = with_photos(pinhole_ring(), tmp_path / "images")
     named = (replace(f, name=f"r_{i}.png", image=tmp_path / f"train/r_{i}.png") for i, f in enumerate(capture.frames))
     write_blender(replace(capture, frames=tuple(named)), tmp_path)
     with pytest.raises(UserError, match="does not exist"):
         parse_blender(tmp_path)
-    (tmp_path / "elsewhere").mkdir()
-    for index in range(len(capture.frames)):
-        (tmp_path / "elsewhere" / f"r_{index}.png").touch()
+    put_photos(tmp_path / "elsewhere", *(f"r_{index}.png" for index in range(len(capture.frames))))
     parsed = parse_blender(tmp_path, UserInputs(tmp_path / "elsewhere"))
     assert [f.image for f in parsed.frames] == [tmp_path / "elsewhere" / f"r_{i}.png" for i in range(6)]
     assert parsed.frames[0].camera.width == 64
 
 
-def test_blender_files_are_read_back(tmp_path, photos_of):
-    photos_of(640, 480)
+def test_blender_files_are_read_back(tmp_path):
     capture = with_photos(pinhole_ring(), tmp_path)
     splits = ("train", "train", "train", "val", "test", "test")
     frames = [replace(frame, split=split) for frame, split in zip(capture.frames, splits, strict=True)]
@@ -309,17 +292,14 @@ def test_blender_files_are_read_back(tmp_path, photos_of):
     assert set(content) == {"camera_angle_x", "frames"}
     assert math.isclose(content["camera_angle_x"], 2 * math.atan(0.64))
     assert [record["file_path"] for record in content["frames"]][:2] == ["./train/r 0", "./my photos/ä 01.jpg"]
-    (tmp_path / "my photos").mkdir()
-    (tmp_path / "train").mkdir()
-    for path in (png, tmp_path / "my photos/ä 03.jpg", tmp_path / "my photos/ä 05.jpg"):
-        path.write_bytes(b"")
+    put_photos(tmp_path, "train/r 0.png", "my photos/ä 03.jpg", "my photos/ä 05.jpg", size=(640, 480))
     back = parse_blender(tmp_path)
     for frame, again in zip(capture.frames, back.frames, strict=True):
         assert (again.name, again.image, again.split) == (frame.name, frame.image, frame.split)
         np.testing.assert_allclose(again.camera.params, frame.camera.params, rtol=1e-14)
         np.testing.assert_allclose(again.world_from_cam, frame.world_from_cam, rtol=0, atol=1e-15)
     png.unlink()  # a missing picture's name gets the suffix of NeRF's loader
-    (tmp_path / "my photos/ä 02.jpg").write_bytes(b"")
+    put_photos(tmp_path, "my photos/ä 02.jpg", size=(640, 480))
     assert parse_blender(tmp_path).frames[0].name == "train/r 0.png"
 
 
