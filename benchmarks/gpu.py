@@ -205,13 +205,13 @@ def same_losses(capture: Path, device: Any, sizes: Sizes) -> dict[str, float]:
     Raises:
         RuntimeError: more than 1e-2.
     """
-    from nerfcli.kernels.reference.backend import ReferenceBackend
+    from nerfcli.kernels import Backend
 
     losses: list[list[Any]] = []
     for plain in (False, True):
         fitting, _ = fitting_of(capture, device, 2 * sizes.batches[0], sizes.log2_rows[0])
         if plain:
-            fitting.field.backend = ReferenceBackend(device)
+            fitting.field.backend = Backend(device)
         losses.append([])
         for step in range(6):
             fitting.advance(0.3 + 0.1 * step)

@@ -74,10 +74,11 @@ def learned(
     rows = field.rows()
     assert rows is not None
     # Gradients are added to the ones that the sink already contains.
-    table_grad = torch.ones_like(rows, requires_grad=False) if with_sink else None
+    if with_sink:
+        field.table_grad = torch.ones_like(rows, requires_grad=False)
     distances = None if targets.distances is None else targets.distances[:count].to(dtype)
     seen = field.backend.render_rays(
-        rays, march, field.medium(), targets._replace(distances=distances), background=background, table_grad=table_grad
+        rays, march, field.medium(), targets._replace(distances=distances), background=background
     )
     total = torch.zeros((), dtype=dtype)
     for values in seen[:4]:
@@ -86,7 +87,7 @@ def learned(
     assert (rows.grad is None) == with_sink or not len(rays.origins)
     gradients = {f"gradient of {key}": value.grad for key, value in field.named_parameters() if value is not rows}
     gradients |= {"gradient of origins": rays.origins.grad, "gradient of directions": rays.directions.grad}
-    gradients["gradient of rows"] = rows.grad if table_grad is None else table_grad - 1.0
+    gradients["gradient of rows"] = rows.grad if field.table_grad is None else field.table_grad - 1.0
     return {**seen._asdict(), **{key: value for key, value in gradients.items() if value is not None}}
 
 

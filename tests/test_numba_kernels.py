@@ -196,7 +196,7 @@ def test_visible_samples_holds_many_rays_of_many_samples(room, generator, monkey
     origins = torch.tensor([0.0, 0.0, -1.0]).repeat(rays, 1)
     directions = torch.tensor([0.0, 0.0, 1.0]).repeat(rays, 1)
     along = March(edges, torch.ones(2, 2, 2, dtype=torch.bool), "none", 7.0)
-    starts, ends, density, _, coordinates, offsets, _ = numba_cpu.visible_samples(
+    starts, ends, density, _, coordinates, offsets, *_ = numba_cpu.visible_samples(
         Rays(origins, directions, torch.zeros(rays)), along, EMPTY
     )
     assert torch.equal(offsets, torch.arange(rays + 1) * 400)

@@ -136,7 +136,7 @@ def test_a_fault_that_does_not_come_back_changes_nothing(bad_call, on_gpu, views
 
 def test_where_no_two_runs_are_the_same_a_failure_is_found_all_the_same(views, tmp_path, monkeypatch):
     """A fault that does not come back is put down to a device that does not repeat its results."""
-    monkeypatch.setattr(NumbaBackend, "deterministic", False)
+    monkeypatch.setattr(NumbaBackend, "__init__", lambda self, device: setattr(self, "deterministic", False))
     poisoned = with_rate_factors(lambda state: math.nan if state.step == 7 and state.rollbacks == 0 else 1.0)
     with monkeypatch.context() as patched:
         patched.setattr(fitting, "update", poisoned)

@@ -173,12 +173,7 @@ def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkey
             return torch.full_like(coordinates[:, 0], sigma)
 
         def radiance(
-            self,
-            coordinates: torch.Tensor,
-            directions: torch.Tensor,
-            rays: torch.Tensor,
-            *,
-            table_grad: torch.Tensor | None,
+            self, coordinates: torch.Tensor, directions: torch.Tensor, rays: torch.Tensor
         ) -> tuple[torch.Tensor, torch.Tensor]:
             return self.density(coordinates), torch.zeros_like(coordinates)
 

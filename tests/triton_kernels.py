@@ -328,14 +328,8 @@ def whole(
     background = torch.rand(count, 3, generator=g).to(device, dtype)
     targets = targets._replace(distances=(0.7 + torch.rand(count // 2, generator=g)).to(device, dtype))
     table_grad = torch.zeros_like(table, requires_grad=False) if with_sink else None
-    seen = backend.render_rays(
-        rays,
-        march,
-        HashGrid(table, resolutions, layers, 3, with_sink),
-        targets,
-        background=background,
-        table_grad=table_grad,
-    )
+    grid = HashGrid(table, resolutions, layers, 3, with_sink, table_grad)
+    seen = backend.render_rays(rays, march, grid, targets, background=background)
     total = sum((x * torch.randn(x.shape, generator=g).to(device, dtype)).sum() for x in seen[:4])
     assert isinstance(total, Tensor)
     total.backward()

@@ -65,10 +65,8 @@ class FourierField(Field):
         """See `kernels.Medium`."""
         return density_from_log(self.log_density(self._hidden(coordinates))[:, 0])
 
-    def radiance(
-        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, table_grad: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """See `kernels.Medium`; there is no table, and the sink is not used."""
+    def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+        """See `kernels.Medium`."""
         hidden = self._hidden(coordinates)
         harmonics = spherical_harmonics(directions, self.settings.view_degree)[rays]
         rgb = torch.sigmoid(self.colour(torch.cat([hidden, harmonics], dim=-1)))

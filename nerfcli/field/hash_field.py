@@ -92,18 +92,17 @@ class HashField(Field):
             tuple(self.weights),
             self.settings.view_degree,
             self.settings.antialias,
+            self.table_grad,
         )
 
     def density(self, coordinates: Tensor) -> Tensor:
         """See `kernels.Medium`; without gradients."""
         return self.backend.density(coordinates, self.medium())
 
-    def radiance(
-        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, table_grad: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
         """See `kernels.Medium`. Backends render the `HashGrid` itself faster."""
         grid = self.medium()
-        encoded = self.backend.hash_encode(coordinates, grid.table, grid.resolutions, table_grad=table_grad)
+        encoded = self.backend.hash_encode(coordinates, grid.table, grid.resolutions, table_grad=self.table_grad)
         return reference.radiance(encoded, spherical_harmonics(directions, grid.view_degree), rays, grid.layers)
 
     @torch.no_grad()

@@ -44,9 +44,10 @@ class Field(nn.Module, abc.ABC):
 
     `backend` renders `medium`. Each kind has its own settings for training: `rate_factor` multiplies the learning rate,
     `row_decay` is the weight decay of rows, see `reference.adam_rows`, and after at most `closing_steps` steps, rays
-    skip all cells that hold little.
+    skip all cells that hold little. A training sets `table_grad`, see `kernels.HashGrid`, for the gradient of `rows`.
     """
 
+    table_grad: Tensor | None = None
     rate_factor: float = 1.0
     row_decay: float = 0.0
     closing_steps: ClassVar[int] = 150
@@ -99,7 +100,5 @@ class Field(nn.Module, abc.ABC):
         """Return the density of points; see `kernels.Medium`."""
 
     @abc.abstractmethod
-    def radiance(
-        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, table_grad: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
         """Return density and colour of points; see `kernels.Medium`."""

@@ -74,15 +74,12 @@ class VoxelField(Field):
         values = self.backend.hash_encode(coordinates, self.table[:1], (self.settings.resolution,))
         return density_from_log(values[:, 0])
 
-    def radiance(
-        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, table_grad: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
         """See `kernels.Medium`."""
         settings, count = self.settings, self.settings.harmonics
         # (N, layers * FEATURES): log density, then red, green and blue of each harmonic; numbers at the end unused.
-        values = self.backend.hash_encode(
-            coordinates, self.table, (settings.resolution,) * settings.layers, table_grad=table_grad
-        )
+        resolutions = (settings.resolution,) * settings.layers
+        values = self.backend.hash_encode(coordinates, self.table, resolutions, table_grad=self.table_grad)
         harmonics = spherical_harmonics(directions, settings.view_degree)[:, :count]
         channels = values[:, 1 : 1 + 3 * count].unflatten(1, (count, 3))
         rgb = torch.sigmoid((harmonics[rays][:, :, None] * channels).sum(1))

@@ -34,7 +34,6 @@ from nerfcli.kernels.interface import (
     Targets,
 )
 from nerfcli.kernels.reference import distances_to_occupied, ray_indices, sum_along_rays
-from nerfcli.kernels.reference.backend import ReferenceBackend
 from nerfcli.version import __version__
 
 __all__ = [
@@ -88,7 +87,7 @@ def backend_for(device: torch.device, dtype: torch.dtype, *, wanted: str = "auto
     fast, why_not = _fast_backend(device, dtype, wanted)
     if fast is None and wanted in ("numba_cpu", "triton_cuda"):
         raise UserError(f"the backend {wanted} cannot be used: {why_not}", "use auto or reference")
-    return fast or ReferenceBackend(device)
+    return fast or Backend(device)
 
 
 def triton_unavailable_reason(device: torch.device) -> str | None:
@@ -169,7 +168,7 @@ def _fast_backend(device: torch.device, dtype: torch.dtype, wanted: str) -> tupl
             return None, f"it supports float32 on the CPU only, not {given}"
         from nerfcli.kernels.numba_cpu.backend import NumbaBackend
 
-        return NumbaBackend(), None
+        return NumbaBackend(device), None
     return None, None
 
 

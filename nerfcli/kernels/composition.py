@@ -1,9 +1,10 @@
-"""Backends: ray operations composed of per-sample kernels. Letters as in `interface`.
+"""The backend in plain torch: ray operations composed of per-sample kernels, which faster backends replace.
+
+Letters as in `interface`.
 
 On a GPU, `render_rays` of a hash grid makes the host wait once, for the number of samples.
 """
 
-import abc
 import math
 from types import ModuleType
 from typing import ClassVar
@@ -11,10 +12,11 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from nerfcli.kernels import reference
 from nerfcli.kernels.contraction import sample_widths
+from nerfcli.kernels.harmonics import spherical_harmonics
 from nerfcli.kernels.interface import (
     UNSEEN,
-    AdamStep,
     HashGrid,
     Intervals,
     March,
@@ -27,20 +29,28 @@ from nerfcli.kernels.interface import (
     Targets,
     Trace,
 )
-from nerfcli.kernels.reference.compositing import contracted_distance, depth_loss, scale_gradients, sum_along_rays
 
 
-class Backend(abc.ABC):
-    """The hot operations on one kind of device.
+class Backend:
+    """The hot operations: here those of `reference`, on any device and in any precision.
 
     `name` is its name in `backend_for`; `deterministic` says whether the same inputs always give the same bits;
     `operations` are the single operations on packed samples, as `reference` defines them. Subclasses differ in these,
     and in how they sample and evaluate a hash grid.
+
+    Args:
+        device: of its tensors; on a GPU, sums are added in varying order, and results do not repeat to the bit.
     """
 
-    name: str
-    deterministic: bool
-    operations: ClassVar[ModuleType]
+    name: str = "reference"
+    operations: ClassVar[ModuleType] = reference
+    adam_rows = staticmethod(reference.adam_rows)
+    project = staticmethod(reference.project)
+    back_project = staticmethod(reference.back_project)
+    denoise_total_variation = staticmethod(reference.denoise_total_variation)
+
+    def __init__(self, device: torch.device):
+        self.deterministic = device.type == "cpu"
 
     def pixel_rays(self, chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]:
         """Return origins (N, 3), directions (N, 3) and colours (N, C) in [0, 1] of chosen pixels (N,) int64."""
@@ -54,7 +64,6 @@ class Backend(abc.ABC):
         targets: Targets = Targets(),
         *,
         background: Tensor,
-        table_grad: Tensor | None = None,
         cell_depths: Tensor | None = None,
         trace: Trace | None = None,
     ) -> RaySums:
@@ -62,8 +71,6 @@ class Backend(abc.ABC):
 
         Args:
             background: (R, 3) sRGB, without gradient.
-            table_grad: of the table's shape; the gradient with respect to the table is added to it instead of being
-                passed to autograd, which saves making, filling and adding a buffer of megabytes at every step.
             cell_depths: (C, C, C) over the unit cube; raised to the optical depth of the samples, including those
                 left out for their weight, see `keep_largest`.
             trace: called with intermediate tensors.
@@ -71,19 +78,18 @@ class Backend(abc.ABC):
         Differentiable in origins, directions, the table and the layers.
         """
         samples = self._visible(rays.detached(), march, medium, cell_depths)
-        starts, ends, offsets = samples.starts, samples.ends, samples.offsets
-        index = self.operations.ray_indices(offsets) if samples.rays is None else samples.rays
+        starts, ends, offsets, index = samples.starts, samples.ends, samples.offsets, samples.rays
         if torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad):
             samples = samples._replace(coordinates=self._coordinates(rays, samples, march.contraction))
         if isinstance(medium, HashGrid):
-            widths = None
             if medium.antialias and rays.cones is not None:
                 widths = sample_widths(rays.detached(), starts, ends, index=index, contraction=march.contraction)
-            density, rgb = self._radiance(samples, rays.directions, index, medium, widths=widths, table_grad=table_grad)
+                samples = samples._replace(widths=widths)
+            density, rgb = self._radiance(samples, rays.directions, medium)
         else:
-            density, rgb = medium.radiance(samples.coordinates, rays.directions, index, table_grad=table_grad)
+            density, rgb = medium.radiance(samples.coordinates, rays.directions, index)
         if targets.near is not None and density.requires_grad:
-            scale_gradients(density, rgb, distance=starts, near=targets.near)
+            reference.scale_gradients(density, rgb, distance=starts, near=targets.near)
         colour, transmittance, weights = self.operations.composite(
             density, rgb, ends - starts, offsets=offsets, background=background
         )
@@ -92,10 +98,8 @@ class Backend(abc.ABC):
             near, far = self._contracted(starts, ends)
             apart = self.operations.distortion(weights, near, far, offsets)
         if targets.distances is not None and len(targets.distances):
-            middles = (starts + ends) / 2
-            off = self._depth_loss(
-                weights, transmittance, middles, offsets=offsets, rays=index, distances=targets.distances
-            )
+            middles, distances = (starts + ends) / 2, targets.distances
+            off = self._depth_loss(weights, transmittance, middles, samples=samples, distances=distances)
         if trace is not None:
             trace("coordinates of samples", samples.coordinates, index)
             if samples.encoded is not None:
@@ -127,9 +131,8 @@ class Backend(abc.ABC):
         """
         samples = self._visible(rays.detached(), march, medium, None)
         starts, ends, density, offsets = samples.starts, samples.ends, samples.density, samples.offsets
-        lengths = ends - starts
+        index, lengths = samples.rays, ends - starts
         weights, _ = self.operations.interval_weights(density, lengths, offsets)
-        index = self.operations.ray_indices(offsets) if samples.rays is None else samples.rays
         unseen = weights <= (negligible / offsets.diff().clamp_min(1).to(weights))[index]
         seen = (~unseen).nonzero()[:, 0]
         rgb = torch.full((len(density), 3), UNSEEN, dtype=density.dtype, device=density.device)
@@ -155,104 +158,56 @@ class Backend(abc.ABC):
             return medium.density(coordinates)
         return self._density_of(self.hash_encode(coordinates, medium.table, medium.resolutions), medium)
 
-    @abc.abstractmethod
     def hash_encode(
         self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, table_grad: Tensor | None = None
     ) -> Tensor:
         """Interpolate tables at points (N, 3) of the unit cube, giving (N, L * F), for media made of tables.
 
-        Differentiable in points and in the table, whose gradient goes into the sink if there is one.
+        Differentiable in points and in the table, whose gradient is added to `table_grad` if that is given.
         """
+        return encode_into(points, table, resolutions, widths=None, table_grad=table_grad)
 
-    @abc.abstractmethod
-    def adam_rows(self, table: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *, step: AdamStep) -> None:
-        """Take one step of Adam with weight decay, in place, on rows with a nonzero gradient, and zero the gradient."""
-
-    @abc.abstractmethod
-    def project(
-        self, volume: Tensor, origins: Tensor, directions: Tensor, *, first: tuple[float, float, float], size: float
-    ) -> Tensor:
-        """Return the line integrals (R,) of a volume (Z, Y, X) along lines in float64; see `reference.project`.
-
-        Differentiable in the volume.
-        """
-
-    @abc.abstractmethod
-    def back_project(
-        self,
-        values: Tensor,
-        origins: Tensor,
-        directions: Tensor,
-        *,
-        shape: tuple[int, int, int],
-        first: tuple[float, float, float],
-        size: float,
-    ) -> Tensor:
-        """Return the transpose of `project`: (Z, Y, X) from (R,), without gradients."""
-
-    @abc.abstractmethod
-    def denoise_total_variation(self, target: Tensor, threshold: Tensor, dual: Tensor, *, iterations: int) -> Tensor:
-        """Return a volume (Z, Y, X) >= 0 near `target` with a smaller total variation, without gradients.
-
-        Args:
-            threshold: (Z, Y, X) > 0.
-            dual: (3, Z, Y, X), overwritten; see `reference.denoise_total_variation`.
-        """
-
-    @abc.abstractmethod
     def _visible_in_grid(self, rays: Rays, along: March, grid: HashGrid, cell_depths: Tensor | None) -> Samples:
         """See `reference.visible_samples`."""
+        return reference.visible_samples(rays, along, grid, cell_depths)
 
-    @abc.abstractmethod
     def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
         """Return the coordinates of samples again, differentiable in their rays."""
+        spans = samples.starts, samples.ends
+        return reference.sample_coordinates(
+            rays.origins, rays.directions, *spans, offsets=samples.offsets, contraction=contraction
+        )
 
-    @abc.abstractmethod
-    def _encoded(self, samples: Samples, grid: HashGrid, *, widths: Tensor | None, table_grad: Tensor | None) -> Tensor:
+    def _encoded(self, samples: Samples, grid: HashGrid) -> Tensor:
         """Return the encoded features of samples again, with gradients."""
+        points, widths, table_grad = samples.coordinates, samples.widths, grid.table_grad
+        return encode_into(points, grid.table, grid.resolutions, widths=widths, table_grad=table_grad)
 
-    @abc.abstractmethod
     def _density_of(self, encoded: Tensor, grid: HashGrid) -> Tensor:
         """Return the densities of encoded features, without gradients."""
+        return reference.density(encoded, grid.layers)
 
-    @abc.abstractmethod
     def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
         """Return densities and colours of encoded features, seen along directions (R, 3) of rays `index` (N,)."""
+        return reference.radiance(encoded, spherical_harmonics(directions, grid.view_degree), index, grid.layers)
 
     def _contracted(self, starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
         """Return `reference.contracted_distance` of the ends of intervals."""
-        return contracted_distance(starts), contracted_distance(ends)
+        return reference.contracted_distance(starts), reference.contracted_distance(ends)
 
     def _depth_loss(
-        self,
-        weights: Tensor,
-        transmittance: Tensor,
-        middles: Tensor,
-        *,
-        offsets: Tensor,
-        rays: Tensor,
-        distances: Tensor,
+        self, weights: Tensor, transmittance: Tensor, middles: Tensor, *, samples: Samples, distances: Tensor
     ) -> Tensor:
-        """See `reference.depth_loss`; `rays` (N,) are the rays of the samples."""
-        return depth_loss(weights, transmittance, middles, offsets=offsets, distances=distances)
+        """See `reference.depth_loss`."""
+        return reference.depth_loss(weights, transmittance, middles, offsets=samples.offsets, distances=distances)
 
     def _sum_along_rays(self, values: Tensor, offsets: Tensor) -> Tensor:
         """See `reference.sum_along_rays`; for scalars (N,), without gradients."""
-        return sum_along_rays(values, offsets)
+        return reference.sum_along_rays(values, offsets)
 
-    def _radiance(
-        self,
-        samples: Samples,
-        directions: Tensor,
-        index: Tensor,
-        grid: HashGrid,
-        *,
-        widths: Tensor | None,
-        table_grad: Tensor | None,
-    ) -> tuple[Tensor, Tensor]:
-        """Return densities and colours of samples along directions (R, 3) of rays `index` (N,), with gradients."""
-        encoded = self._encoded(samples, grid, widths=widths, table_grad=table_grad)
-        return self._networks(encoded, directions, index, grid)
+    def _radiance(self, samples: Samples, directions: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
+        """Return densities and colours of samples along directions (R, 3) of rays, with gradients."""
+        return self._networks(self._encoded(samples, grid), directions, samples.rays, grid)
 
     def _visible(self, rays: Rays, march: March, medium: HashGrid | Medium, cell_depths: Tensor | None) -> Samples:
         if isinstance(medium, HashGrid):
@@ -264,4 +219,23 @@ class Backend(abc.ABC):
             kept = torch.nn.functional.pad(reached.cumsum(0), (1, 0))[offsets]
             if cell_depths is not None:
                 self.operations.keep_largest(cell_depths, coordinates[reached], (density * (ends - starts))[reached])
-            return Samples(starts[reached], ends[reached], density[reached], None, coordinates[reached], kept)
+            rays_of_samples = self.operations.ray_indices(kept)
+            return Samples(
+                starts[reached], ends[reached], density[reached], None, coordinates[reached], kept, rays_of_samples
+            )
+
+
+def encode_into(
+    points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, widths: Tensor | None, table_grad: Tensor | None
+) -> Tensor:
+    """Return `reference.hash_encode`; the gradient by the table is added to `table_grad` if that is given."""
+    if table_grad is None or not (table.requires_grad and torch.is_grad_enabled()):
+        return reference.hash_encode(points, table, resolutions, widths)
+    leaf = table.detach().to(table_grad.dtype).requires_grad_()  # gradients of a half-precision table are not rounded
+
+    def add_to_sink(given: Tensor) -> None:
+        if given.grad is not None:
+            table_grad.add_(given.grad)
+
+    leaf.register_post_accumulate_grad_hook(add_to_sink)
+    return reference.hash_encode(points, leaf, resolutions, widths)

@@ -72,6 +72,8 @@ class HashGrid(NamedTuple):
         layers: weights of the networks: W1 (H, L * F), W2 (A, H), C1 (H, A + 16), C2 (H, H), C3 (3, H), see `radiance`.
         view_degree: highest degree of the direction's spherical harmonics that colours depend on, 0 to 3.
         antialias: whether levels finer than a ray's cone fade out.
+        table_grad: of the table's shape; the gradient by the table is added to it instead of being passed to autograd,
+            which saves making, filling and adding a buffer of megabytes at every step. None to use autograd.
     """
 
     table: Tensor
@@ -79,6 +81,7 @@ class HashGrid(NamedTuple):
     layers: tuple[Tensor, ...]
     view_degree: int = 3
     antialias: bool = False
+    table_grad: Tensor | None = None
 
 
 class Medium(Protocol):
@@ -88,14 +91,8 @@ class Medium(Protocol):
         """Return the density (N,), in 1 / training unit, at coordinates (N, 3) of the unit cube."""
         ...
 
-    def radiance(
-        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, table_grad: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Return density (N,) and sRGB colour (N, 3) at coordinates (N, 3) along `directions` (R, 3) of `rays` (N,).
-
-        Args:
-            table_grad: buffer to which the gradient of the field's table is added, instead of passing it to autograd.
-        """
+    def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+        """Return density (N,) and sRGB colour (N, 3) at coordinates (N, 3) along `directions` (R, 3) of `rays` (N,)."""
         ...
 
 
@@ -193,7 +190,8 @@ class Samples(NamedTuple):
         encoded: (N, L * F) features of the hash grid at the samples; None for another medium.
         coordinates: (N, 3) in the field's unit cube.
         offsets: (R + 1,).
-        rays: (N,) int64, the ray of each sample, if it has been computed already.
+        rays: (N,) int64, the ray of each sample.
+        widths: (N,) of a pixel at the samples, see `contraction.cube_widths`; None if details do not fade out.
     """
 
     starts: Tensor
@@ -202,7 +200,8 @@ class Samples(NamedTuple):
     encoded: Tensor | None
     coordinates: Tensor
     offsets: Tensor
-    rays: Tensor | None = None
+    rays: Tensor
+    widths: Tensor | None = None
 
 
 class BearingGrids(NamedTuple):

@@ -210,7 +210,7 @@ class Fitting:
             losses.samples,
             rays=whole.rays,
             leaves=(*self.optimiser.weights(), *self.appearance.parameters(), *rays),
-            table_grad=self.optimiser.table_grad,
+            table_grad=self.field.table_grad,
         )
         return StepLosses(weighted, colours, samples)
 
@@ -232,8 +232,8 @@ class Fitting:
         # Non-finite if any term is. One sum of all is faster on a GPU than many small ones.
         loss = losses.sum()
         total = torch.cat([loss.view(1), *(gradient.flatten() for gradient in gradients.values())]).sum()
-        if self.optimiser.table_grad is not None:
-            watch.values("gradient of rows", self.optimiser.table_grad)
+        if self.field.table_grad is not None:
+            watch.values("gradient of rows", self.field.table_grad)
         absent = torch.zeros_like(loss)
         weighted = [losses.weighted.get(name, absent) for name in LOSSES]
         self._take_losses(self._sent.exchange(torch.stack([total, *weighted])))

@@ -92,8 +92,8 @@ def _place_of_count(parameter: Tensor) -> torch.device:
 class FieldOptimiser:
     """Adam's moments for a field's rows and weights.
 
-    `table_grad` accumulates the gradient of the rows: it is allocated once, passed to `Backend.render_rays`, and zero
-    again after each step. None for a field without rows.
+    The gradient of the rows is added up in `Field.table_grad`, which is allocated here, once, and zero again after each
+    step. It stays None for a field without rows.
     """
 
     def __init__(self, field: Field):
@@ -101,9 +101,11 @@ class FieldOptimiser:
         rows = field.rows()
         self._weights = {name: parameter for name, parameter in field.named_parameters() if parameter is not rows}
         self._adam = Adam(self._weights.values())
-        self.table_grad = self._first = self._second = None
+        self._first = self._second = None
         if rows is not None:
-            self.table_grad, self._first, self._second = (torch.zeros_like(rows, requires_grad=False) for _ in range(3))
+            field.table_grad, self._first, self._second = (
+                torch.zeros_like(rows, requires_grad=False) for _ in range(3)
+            )
 
     def zero_grad(self) -> None:
         """Clear the gradients of the weights; the step that used those of the rows has cleared them already."""
@@ -115,18 +117,18 @@ class FieldOptimiser:
 
     def gradients(self) -> dict[str, Tensor]:
         """Return by name the gradients that any non-finite number reaches: those of the weights, or of rows alone."""
-        if not self._weights and self.table_grad is not None:
-            return {"rows": self.table_grad}
+        if not self._weights and self._field.table_grad is not None:
+            return {"rows": self._field.table_grad}
         return {name: weight.grad for name, weight in self._weights.items() if weight.grad is not None}
 
     def step(self, number: int, rate: float, *, decay: float) -> None:
         """Take step `number`, counted from 1, at a learning rate and with a weight decay of rows."""
         rate = rate * self._field.rate_factor
         self._adam.step(rate)
-        rows = self._field.rows()
-        if rows is not None and self.table_grad is not None and self._first is not None and self._second is not None:
+        rows, gradient = self._field.rows(), self._field.table_grad
+        if rows is not None and gradient is not None and self._first is not None and self._second is not None:
             step = AdamStep(number, rate, BETAS, EPS, decay)
-            self._field.backend.adam_rows(rows, self.table_grad, self._first, self._second, step=step)
+            self._field.backend.adam_rows(rows, gradient, self._first, self._second, step=step)
 
     def state(self) -> dict[str, Tensor]:
         """Return the state for `restore`, without the field's own tensors."""
@@ -139,8 +141,8 @@ class FieldOptimiser:
         """Restore the state from `state`; other tensors are ignored."""
         if self._first is not None:
             self._first, self._second = tensors["table_first"], tensors["table_second"]
-        if self.table_grad is not None:
-            self.table_grad.zero_()  # a step may have failed before using it
+        if self._field.table_grad is not None:
+            self._field.table_grad.zero_()  # a step may have failed before using it
         self._adam.restore(tensors, "adam")
 
 

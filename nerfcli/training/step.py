@@ -109,7 +109,7 @@ class StepLosses:
 def step(state: State, batch: Batch, plan: StepPlan, watch: Watch = UNWATCHED) -> StepLosses:
     """Render the rays of a batch, and return their losses; the gradients are in the state afterwards.
 
-    Those of rows are added to `FieldOptimiser.table_grad`, all others are the `grad` of their tensors.
+    Those of rows are added to `Field.table_grad`, all others are the `grad` of their tensors.
     """
     state.optimiser.zero_grad()
     state.parts_optimiser.zero_grad()
@@ -131,7 +131,6 @@ def losses_of(state: State, batch: Batch, plan: StepPlan, watch: Watch) -> StepL
         state.field.medium(plan.detail),
         Targets(nearest, "distortion" in plan.weights, pixels.distances),
         background=batch.behind,
-        table_grad=state.optimiser.table_grad,
         cell_depths=state.cells.cell_depths,
         trace=watch.rows,
     )

@@ -11,7 +11,6 @@ from nerfcli.kernels import numba_cpu, reference
 from nerfcli.kernels.composition import Backend
 from nerfcli.kernels.harmonics import spherical_harmonics
 from nerfcli.kernels.interface import FEATURES, AdamStep, HashGrid, March, Medium, Rays, RaysSeen, Samples
-from nerfcli.kernels.reference.backend import encode_into
 
 
 class NumbaBackend(Backend):
@@ -19,7 +18,6 @@ class NumbaBackend(Backend):
 
     name = "numba_cpu"
     operations = numba_cpu
-    deterministic = True
     project = staticmethod(numba_cpu.project)
     back_project = staticmethod(numba_cpu.back_project)
     denoise_total_variation = staticmethod(numba_cpu.denoise_total_variation)
@@ -53,7 +51,9 @@ class NumbaBackend(Backend):
     def hash_encode(
         self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, table_grad: Tensor | None = None
     ) -> Tensor:
-        return _encode(points, table, resolutions, computed=None, widths=None, table_grad=table_grad)
+        if numba_cpu.can_hash_encode(points, table, resolutions):
+            return numba_cpu.hash_encode(points, table, resolutions, table_grad)
+        return super().hash_encode(points, table, resolutions, table_grad=table_grad)
 
     def adam_rows(self, table: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *, step: AdamStep) -> None:
         module = numba_cpu if table.shape[-1] == FEATURES else reference
@@ -74,14 +74,11 @@ class NumbaBackend(Backend):
             computed=samples.coordinates,
         )
 
-    def _encoded(self, samples: Samples, grid: HashGrid, *, widths: Tensor | None, table_grad: Tensor | None) -> Tensor:
-        return _encode(
-            samples.coordinates,
-            grid.table,
-            grid.resolutions,
-            computed=samples.encoded,
-            widths=widths,
-            table_grad=table_grad,
+    def _encoded(self, samples: Samples, grid: HashGrid) -> Tensor:
+        if not numba_cpu.can_hash_encode(samples.coordinates, grid.table, grid.resolutions):
+            return super()._encoded(samples, grid)
+        return numba_cpu.hash_encode(
+            samples.coordinates, grid.table, grid.resolutions, grid.table_grad, samples.encoded, samples.widths
         )
 
     def _density_of(self, encoded: Tensor, grid: HashGrid) -> Tensor:
@@ -91,20 +88,6 @@ class NumbaBackend(Backend):
     def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
         module = numba_cpu if numba_cpu.can_radiance(encoded, grid.layers) else reference
         return module.radiance(encoded, spherical_harmonics(directions, grid.view_degree), index, grid.layers)
-
-
-def _encode(
-    points: Tensor,
-    table: Tensor,
-    resolutions: tuple[int, ...],
-    *,
-    computed: Tensor | None,
-    widths: Tensor | None,
-    table_grad: Tensor | None,
-) -> Tensor:
-    if numba_cpu.can_hash_encode(points, table, resolutions):
-        return numba_cpu.hash_encode(points, table, resolutions, table_grad, computed, widths)
-    return encode_into(points, table, resolutions, widths=widths, table_grad=table_grad)
 
 
 def _fits(grid: HashGrid, layers: tuple[Tensor, ...]) -> bool:

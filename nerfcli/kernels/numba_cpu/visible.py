@@ -16,7 +16,7 @@ from nerfcli.kernels.numba_cpu.empty_space import WINDOW, chunks_near, empty_spa
 from nerfcli.kernels.numba_cpu.hash_grid import encode_range, new_scratch, table_of
 from nerfcli.kernels.numba_cpu.marching import keep_largest
 from nerfcli.kernels.numba_cpu.networks import TILE, density_range, flat_weights
-from nerfcli.kernels.numba_cpu.rays import CHUNK, cut, look_ahead, walk_of
+from nerfcli.kernels.numba_cpu.rays import CHUNK, cut, look_ahead, ray_indices, walk_of
 from nerfcli.kernels.numba_cpu.threads import use_threads
 
 # Rays that a thread works on at a time, and samples that each of them looks ahead.
@@ -256,4 +256,5 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid, cell_depths: torch
         keep_largest(cell_depths, coordinates, density * (ends - starts))
         for faint, number in zip(torch.from_numpy(left), missing.tolist(), strict=True):
             keep_largest(cell_depths, faint[:number, :3], faint[:number, 3])
-    return Samples(starts, ends, density, encoded, coordinates, torch.from_numpy(offsets))
+    packed = torch.from_numpy(offsets)
+    return Samples(starts, ends, density, encoded, coordinates, packed, ray_indices(packed))

@@ -97,7 +97,8 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid, cell_depths: Tenso
     faint &= ~faint.all()
     seen = reached & ~faint
     kept = torch.nn.functional.pad(seen.cumsum(0), (1, 0))[offsets]
-    return Samples(starts[seen], ends[seen], thickness[seen], encoded[seen], coordinates[seen], kept)
+    index = ray_indices(kept)
+    return Samples(starts[seen], ends[seen], thickness[seen], encoded[seen], coordinates[seen], kept, index)
 
 
 # Blocks per axis of `distances_to_occupied` at most: their distances then stay in a processor's cache.

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels import reference
+from nerfcli.kernels.composition import Backend
 from nerfcli.kernels.interface import FEATURES, AdamStep, HashGrid, March, Rays, Samples
-from nerfcli.kernels.reference.backend import ReferenceBackend
 from nerfcli.kernels.triton_cuda import compositing, hash_grid, marching, networks, operations, rays
 from nerfcli.kernels.triton_cuda.coordinates import sample_coordinates
 from nerfcli.kernels.triton_cuda.row_adam import adam_rows
@@ -34,7 +34,7 @@ class HalfCopy:
         return self._half
 
 
-class TritonBackend(ReferenceBackend):
+class TritonBackend(Backend):
     """Backend composed of `triton_cuda`. Sums are atomic: results of the same seed differ in their last digits."""
 
     name = "triton_cuda"
@@ -87,38 +87,22 @@ class TritonBackend(ReferenceBackend):
             computed=samples.coordinates,
         )
 
-    def _radiance(
-        self,
-        samples: Samples,
-        directions: Tensor,
-        index: Tensor,
-        grid: HashGrid,
-        *,
-        widths: Tensor | None,
-        table_grad: Tensor | None,
-    ) -> tuple[Tensor, Tensor]:
+    def _radiance(self, samples: Samples, directions: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
         if not _fits(grid):
-            return super()._radiance(samples, directions, index, grid, widths=widths, table_grad=table_grad)
+            return super()._radiance(samples, directions, grid)
         assert samples.encoded is not None
         return _Radiance.apply(
-            samples.coordinates, directions, grid.table, self._half.of(grid.table), table_grad, samples.encoded, index,
-            samples.offsets, grid.resolutions, grid.view_degree, widths, *grid.layers,
+            samples.coordinates, directions, grid.table, self._half.of(grid.table), grid.table_grad, samples.encoded,
+            samples.rays, samples.offsets, grid.resolutions, grid.view_degree, samples.widths, *grid.layers,
         )  # fmt: skip
 
     def _contracted(self, starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
         return compositing.contracted_distances(starts, ends)
 
     def _depth_loss(
-        self,
-        weights: Tensor,
-        transmittance: Tensor,
-        middles: Tensor,
-        *,
-        offsets: Tensor,
-        rays: Tensor,
-        distances: Tensor,
+        self, weights: Tensor, transmittance: Tensor, middles: Tensor, *, samples: Samples, distances: Tensor
     ) -> Tensor:
-        return compositing.depth_loss(weights, transmittance, middles, rays=rays, distances=distances)
+        return compositing.depth_loss(weights, transmittance, middles, rays=samples.rays, distances=distances)
 
     def _sum_along_rays(self, values: Tensor, offsets: Tensor) -> Tensor:
         return rays.sum_along_rays(values[:, None], offsets)[:, 0]

@@ -22,12 +22,12 @@ def warm_up(device: torch.device) -> None:
     table = torch.zeros(8, 16, 4, device=device, requires_grad=True)
     shapes = ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))
     layers = tuple(torch.zeros(shape, device=device, requires_grad=True) for shape in shapes)
-    grid = HashGrid(table, (2,) * 8, layers)
+    table_grad, mean, square = (torch.zeros(8, 16, 4, device=device) for _ in range(3))
+    grid = HashGrid(table, (2,) * 8, layers, table_grad=table_grad)
     # Of detailed fields, which note the cells of their samples; and of components that are not on by default.
     other = grid._replace(view_degree=0, antialias=True)
     cell_depths = torch.full((2, 2, 2), -1.0, device=device)
     edges, occupied = torch.linspace(0.0, 0.5, 6, device=device), torch.ones(2, 2, 2, dtype=torch.bool, device=device)
-    table_grad, mean, square = (torch.zeros(8, 16, 4, device=device) for _ in range(3))
     for contraction in ("none", "l2"):
         march = March(edges, occupied, contraction, 7.0)
         for learn, (field, cells) in product((False, True), ((grid, None), (other, cell_depths))):
@@ -40,7 +40,6 @@ def warm_up(device: torch.device) -> None:
                 field,
                 Targets(distortion=True),
                 background=torch.zeros(2, 3, device=device),
-                table_grad=table_grad,
                 cell_depths=cells,
             )
             (sums.rgb.sum() + sums.distortion.sum()).backward()
