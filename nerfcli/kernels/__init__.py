@@ -36,37 +36,6 @@ from nerfcli.kernels.interface import (
 from nerfcli.kernels.reference import distances_to_occupied, ray_indices, sum_along_rays
 from nerfcli.version import __version__
 
-__all__ = [
-    "CONTRACTIONS",
-    "AdamStep",
-    "Backend",
-    "BearingGrids",
-    "HashGrid",
-    "Intervals",
-    "March",
-    "Medium",
-    "PixelTable",
-    "RaySums",
-    "RayTermination",
-    "Rays",
-    "RaysSeen",
-    "Targets",
-    "backend_for",
-    "contract",
-    "describe_machine",
-    "distances_to_occupied",
-    "driver_version",
-    "gpu_launcher",
-    "grid_coordinates",
-    "has_compiled",
-    "prepare",
-    "ray_indices",
-    "spherical_harmonics",
-    "sum_along_rays",
-    "thread_safe",
-    "triton_unavailable_reason",
-]
-
 BACKENDS = ("auto", "reference", "numba_cpu", "triton_cuda")
 
 

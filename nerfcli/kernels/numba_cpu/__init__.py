@@ -16,34 +16,6 @@ from nerfcli.kernels.numba_cpu.tracing import trace_rays
 from nerfcli.kernels.numba_cpu.visible import visible_samples
 from nerfcli.kernels.numba_cpu.volumes import back_project, denoise_total_variation, project
 
-__all__ = [
-    "adam_rows",
-    "back_project",
-    "can_hash_encode",
-    "can_radiance",
-    "composite",
-    "denoise_total_variation",
-    "density",
-    "distortion",
-    "hash_encode",
-    "interval_weights",
-    "is_compiled",
-    "keep_largest",
-    "occupied_samples",
-    "optical_depth_before",
-    "pixel_rays",
-    "project",
-    "radiance",
-    "ray_indices",
-    "ray_termination",
-    "sample_coordinates",
-    "thread_safe",
-    "trace_rays",
-    "visible_samples",
-    "warm_up",
-]
-
-
 machine_code.discard_outdated(machine_code.sources(), machine_code.folder())
 
 

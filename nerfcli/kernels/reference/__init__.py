@@ -29,33 +29,3 @@ from nerfcli.kernels.reference.networks import density, geometry, radiance
 from nerfcli.kernels.reference.pixels import pixel_rays
 from nerfcli.kernels.reference.row_adam import adam_rows
 from nerfcli.kernels.reference.volumes import back_project, denoise_total_variation, project, total_variation
-
-__all__ = [
-    "adam_rows",
-    "back_project",
-    "composite",
-    "contracted_distance",
-    "corner_rows",
-    "denoise_total_variation",
-    "density",
-    "depth_loss",
-    "distances_to_occupied",
-    "distortion",
-    "geometry",
-    "hash_encode",
-    "interval_weights",
-    "keep_largest",
-    "march",
-    "occupied_samples",
-    "optical_depth_before",
-    "pixel_rays",
-    "project",
-    "radiance",
-    "ray_indices",
-    "ray_termination",
-    "sample_coordinates",
-    "scale_gradients",
-    "sum_along_rays",
-    "total_variation",
-    "visible_samples",
-]
