@@ -85,7 +85,7 @@ def tracks_in(scene: Capture) -> Tracks:
 def test_points_are_found_at_their_pixels_with_their_distances_and_trust(capture):
     similarity = Similarity(0.5, np.eye(3), np.array([1.0, 2.0, 3.0]))
     pool = pool_of(capture, "empty", similarity=similarity)
-    of_points = point_depths(tracks_in(capture), pool, similarity)
+    of_points = point_depths(tracks_in(capture), pool)
     rays = pool.rays_of(of_points.numbers)
     reached = rays.origins + rays.directions * of_points.distances[:, None]
     expected = torch.from_numpy(similarity.apply(np.concatenate([POINTS, POINTS]))).float()
@@ -105,7 +105,7 @@ def test_points_are_found_at_their_pixels_with_their_distances_and_trust(capture
 def test_points_behind_a_mask_are_not_looked_at(capture):
     one = Similarity(1.0, np.eye(3), np.zeros(3))
     pool = pool_of(capture, "ignore", similarity=one)
-    of_points = point_depths(tracks_in(capture), pool, one)
+    of_points = point_depths(tracks_in(capture), pool)
     columns = [pool.place(number)[1] for number in of_points.numbers.tolist()]
     assert len(columns) == 3
     assert min(columns) >= 6
@@ -117,7 +117,7 @@ def test_only_training_photos_place_points(capture):
     one = Similarity(1.0, np.eye(3), np.zeros(3))
     tracks = tracks_in(held_out)
     assert set(tracks.photos.tolist()) == {0}
-    assert len(point_depths(tracks, pool_of(held_out, "empty", similarity=one), one).numbers) == 0
+    assert len(point_depths(tracks, pool_of(held_out, "empty", similarity=one)).numbers) == 0
 
 
 def test_a_model_without_sightings_gives_no_tracks(spheres):
@@ -165,7 +165,7 @@ def test_the_gradient_of_light_off_its_target_is_right():
 def test_an_eighth_as_many_known_pixels_are_drawn_as_others(capture):
     one = Similarity(1.0, np.eye(3), np.zeros(3))
     pool = pool_of(capture, "empty", similarity=one)
-    of_points = point_depths(tracks_in(capture), pool, one)
+    of_points = point_depths(tracks_in(capture), pool)
     generator = torch.Generator().manual_seed(0)
     both = PointRays([of_points], pool).added_to(pool.draw(80, generator), generator)
     assert (len(both.numbers), len(both.distances), len(both.trust)) == (90, 10, 10)

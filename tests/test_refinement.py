@@ -158,7 +158,7 @@ def test_photos_of_a_stabilised_lens_change_together(small):
     refinement = Refinement("all", pool_of(scene))
     assert refinement.lenses is not None
     refinement.lenses.values.copy_(torch.tensor([[0.02, 0.01, -0.01]], dtype=torch.float64))
-    training, held_out = refinement.frames(scene.train_frames, scene.test_frames, scale=1.0)
+    training, held_out = refinement.frames(scene.train_frames, scene.test_frames)
     before = {frame.name: frame.camera for frame in scene.frames}
     for frame in (*training, *held_out):
         assert frame.camera == changed(before[frame.name], ("focal", "k1", "k2"), np.array([0.02, 0.01, -0.01]))
@@ -511,7 +511,7 @@ def test_frames_are_where_the_cameras_of_the_training_frame_are(small):
     assert refinement.poses is not None
     twists = np.random.default_rng(0).normal(size=(3, 6)) * 0.1
     refinement.poses.motions.copy_(torch.from_numpy(transform_from_twist(twists)))
-    refined, held_out = refinement.frames(small.train_frames, small.test_frames, scale=similarity.scale)
+    refined, held_out = refinement.frames(small.train_frames, small.test_frames)
     poses = similarity.apply_pose(np.array([frame.world_from_cam for frame in refined]))
     np.testing.assert_allclose(poses, refinement.poses.poses(), atol=1e-5)  # those of the pool are float32
     assert np.array_equal(held_out[0].world_from_cam, small.test_frames[0].world_from_cam)

@@ -78,7 +78,7 @@ def known_points(pool: PixelPool, *, seed: int = 0, count: int = 400) -> PointDe
     for index in range(len(pool.frames)):
         places = np.unique(rng.integers(0, (160, 120), (count, 2)), axis=0)
         dense.append(DenseDepth(places, true_distances(places, index), np.full(len(places), 0.01)))
-    return dense_points(dense, pool, TRAINING)
+    return dense_points(dense, pool)
 
 
 def true_distances(places: np.ndarray, index: int) -> np.ndarray:
@@ -88,7 +88,7 @@ def true_distances(places: np.ndarray, index: int) -> np.ndarray:
 
 def measured(pool: PixelPool, said: list[str] | None = None, *, count: int = 400) -> list[DenseDepth]:
     notes: list[str] = [] if said is None else said
-    return sensor_depths(known_points(pool, count=count), pool, training_scale=TRAINING.scale, notify=notes.append)
+    return sensor_depths(known_points(pool, count=count), pool, notify=notes.append)
 
 
 def errors(depths: Sequence[DenseDepth]) -> np.ndarray:
@@ -109,7 +109,7 @@ def test_depths_in_another_unit_and_size_are_distances_along_the_rays(tmp_path, 
     assert all(len(depth.pixels) > 0.8 * 80 * 60 for depth in found)
     assert f"{unit / 1e-3 / METRES:.4g} scene units per metre" in said[0]
     assert "another" not in said[0]
-    points = dense_points(found, pool, TRAINING)
+    points = dense_points(found, pool)
     assert points.distances.numpy() == pytest.approx(
         np.concatenate([depth.distances for depth in found]) * TRAINING.scale, rel=1e-5
     )
@@ -145,7 +145,7 @@ def test_the_view_of_a_depth_camera_beside_the_photos_is_found(tmp_path):
     said: list[str] = []
     camera = Camera.pinhole(160, 120, 1.1 * 120.0)
     pool = place(tmp_path, [levels_of(z_of(camera, 0.1 * i - 0.025)) for i in range(6)])
-    points = seen_points(known_points(pool, count=2000), pool, training_scale=TRAINING.scale)
+    points = seen_points(known_points(pool, count=2000), pool)
     maps = [read_sensor_depth(frame.depth, frame.image).z for frame in pool.frames]  # type: ignore[arg-type]
     fit = fitted(list(zip(points, maps, strict=True)))
     assert fit is not None
@@ -188,7 +188,7 @@ def test_depths_that_nothing_confirms_are_not_used(tmp_path):
     assert all(len(depth.pixels) == 0 for depth in measured(pool, said))
     assert "the depths of the sensor are not used: only" in said[0]
     nothing = PointDepths(torch.zeros(0, dtype=torch.int64), torch.zeros(0), torch.zeros(0))
-    sensor_depths(nothing, pool, training_scale=1.0, notify=said.append)
+    sensor_depths(nothing, pool, notify=said.append)
     assert said[1] == "the depths of the sensor are not used: too few points that photos see have one"
 
 

@@ -139,7 +139,7 @@ def test_depths_are_pixels_of_the_pool_in_its_frame():
     photos = [photo(x) for x in OFFSETS]
     pool = PixelPool(photos, similarity, torch.device("cpu"))
     depths = found(photos)
-    of_stereo = dense_points(depths, pool, similarity)
+    of_stereo = dense_points(depths, pool)
     rays = pool.rays_of(of_stereo.numbers)
     points = similarity.inverse().apply(
         (rays.origins + rays.directions * of_stereo.distances[:, None]).double().numpy()

@@ -124,7 +124,7 @@ class Checkpoints:
         refinement = self._fitting.appearance.cameras
         if refinement is None:
             return given
-        return refinement.frames(*given, scale=self._inputs.extent.training_from_scene.scale)
+        return refinement.frames(*given)
 
     def write_cameras(self) -> None:
         """Write RUN/cameras.json, with the exposures of held-out photos."""

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.cameras.rigid import Similarity, apply, inverse
+from nerfcli.cameras.rigid import apply, inverse
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import find_model, parse_colmap, parse_model
 from nerfcli.errors import reason_of
@@ -24,7 +24,6 @@ from nerfcli.matching.tracks import Tracks, indices_by_value, triangulate, world
 from nerfcli.photos.exif import log_exposures
 from nerfcli.photos.held_out_exposure import exif_slope
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.training.extent import Extent
 from nerfcli.training.pool import Album, PixelPool, PointDepths
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
@@ -152,7 +151,6 @@ def may_use_points(
 def collect_evidence(
     photos: TrainingPhotos,
     pool: PixelPool,
-    extent: Extent,
     *,
     settings: TrainSettings,
     is_new: bool,
@@ -182,7 +180,7 @@ def collect_evidence(
     points_are_open = selects and may_use_points(wanted, fixed, has_alpha=pool.has_alpha, cameras=found.cameras)
     if wanted.points or (points_are_open and (shared.of_model.count or found.may_match)):
         with found.timed("points"):
-            found.track_depths = point_depths(shared.tracks, pool, extent.training_from_scene)
+            found.track_depths = point_depths(shared.tracks, pool)
 
     seconds, cores = budget.of_stereo(threads)
     side_px = affordable_side_px(album, seconds=seconds, threads=cores)
@@ -196,7 +194,7 @@ def collect_evidence(
         with found.timed("stereo"):
             dense = dense_depths(album, shared.tracks, longer_side_px=side_px or LEAST_SIDE_PX, threads=threads)
     if with_depths:
-        found.stereo_depths = dense_points(dense, pool, extent.training_from_scene)
+        found.stereo_depths = dense_points(dense, pool)
         count = len(found.stereo_depths.numbers)
         notify(f"stereo matching: the depth of {count} pixels of the training photos, {found.seconds['stereo']:.1f} s")
 
@@ -215,26 +213,20 @@ def collect_evidence(
     sensor_is_open = selects and "sensor" not in fixed and not pool.has_alpha
     can_match = shared.of_model.count or budget.allows_matching(shared.matching_seconds)
     if wanted.sensor or (sensor_is_open and can_match):
-        _find_sensor_depths(found, photos, pool, training_from_scene=extent.training_from_scene, notify=notify)
+        _find_sensor_depths(found, photos, pool, notify=notify)
     return found
 
 
 def _find_sensor_depths(
-    found: Evidence,
-    photos: TrainingPhotos,
-    pool: PixelPool,
-    *,
-    training_from_scene: Similarity,
-    notify: Callable[[str], None],
+    found: Evidence, photos: TrainingPhotos, pool: PixelPool, *, notify: Callable[[str], None]
 ) -> None:
     """Fill in the depths of a sensor, checked with what is found already."""
     if not any(frame.depth is not None and not frame.camera.is_spherical for frame in pool.frames):
         return
     with found.timed("sensor"):
-        tracks = found.track_depths or point_depths(photos.shared.tracks, pool, training_from_scene)
+        tracks = found.track_depths or point_depths(photos.shared.tracks, pool)
         known = tracks if found.stereo_depths is None else tracks.joined(found.stereo_depths)
-        measured = sensor_depths(known, pool, training_scale=training_from_scene.scale, notify=notify)
-        found.sensor_depths = dense_points(measured, pool, training_from_scene)
+        found.sensor_depths = dense_points(sensor_depths(known, pool, notify=notify), pool)
 
 
 def tracks_of_model(scene: Capture, photos: Sequence[LoadedPhoto]) -> Tracks:
@@ -262,7 +254,7 @@ def tracks_of_model(scene: Capture, photos: Sequence[LoadedPhoto]) -> Tracks:
     return Tracks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarity) -> PointDepths:
+def point_depths(tracks: Tracks, pool: PixelPool) -> PointDepths:
     """Return the usable pixels that see a triangulated point; empty if there are none.
 
     trust = 1 / (1 + (reprojection error / 1 px)^2), in pixels of the training photos
@@ -284,12 +276,12 @@ def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarit
     inside = numbers >= 0
     kept = kept[inside]
     centres = np.array([frame.centre for frame in pool.frames])[tracks.photos[kept]]
-    distances = np.linalg.norm(surface.points[tracks.points[kept]] - centres, axis=1) * training_from_scene.scale
+    distances = np.linalg.norm(surface.points[tracks.points[kept]] - centres, axis=1) * pool.training_from_scene.scale
     trust = 1.0 / (1.0 + (surface.misses_px[kept] / HALF_ERROR_PX) ** 2)
     return _usable(numbers[inside], distances, trust, pool=pool)
 
 
-def dense_points(dense: Sequence[DenseDepth], pool: PixelPool, training_from_scene: Similarity) -> PointDepths:
+def dense_points(dense: Sequence[DenseDepth], pool: PixelPool) -> PointDepths:
     """Return the usable pixels of a pool whose depth is known from stereo matching or from a sensor.
 
     trust = 1 / (1 + (error / 5 %)^2)
@@ -300,7 +292,7 @@ def dense_points(dense: Sequence[DenseDepth], pool: PixelPool, training_from_sce
     widths = [frame.camera.width for frame in pool.frames]
     firsts = pool.first_pixel.tolist()
     numbers = [first + depth.pixels @ (1, width) for first, width, depth in zip(firsts, widths, dense, strict=True)]
-    distances = np.concatenate([depth.distances for depth in dense]) * training_from_scene.scale
+    distances = np.concatenate([depth.distances for depth in dense]) * pool.training_from_scene.scale
     trust = 1.0 / (1.0 + np.square(np.concatenate([depth.errors for depth in dense]) / HALF_ERROR))
     return _usable(np.concatenate(numbers), distances, trust, pool=pool)
 

@@ -206,7 +206,7 @@ def pixel_footprint(frames: Sequence[Frame], training_from_scene: Similarity) ->
 class PixelPool:
     """All usable pixels of a set of photos, and their rays in the training frame.
 
-    Photos of one lens share its bearings, see `BearingTables`. `frames` are those of the photos;
+    Photos of one lens share its bearings, see `BearingTables`. `frames` are those of the photos, in the scene's frame;
     `without_ray` is the number of pixels without a direction in the lens model, which are left out; `footprint` is from
     `pixel_footprint`; `cones` (P,) are the widths of a pixel of each photo at distance 1; `sizes` (P, 2) are the
     heights and widths of the photos.
@@ -229,6 +229,7 @@ class PixelPool:
     ):
         self.colours = torch.from_numpy(_one_after_another(photos) if colours is None else colours).to(device)
         self._backend = backend_for(device, torch.float32)
+        self.training_from_scene = training_from_scene
         counts = [photo.pixels.shape[0] * photo.pixels.shape[1] for photo in photos]
         self.first_pixel = torch.tensor(np.cumsum([0, *counts[:-1]]), device=device)
         self.sizes = torch.tensor([photo.pixels.shape[:2] for photo in photos], device=device)

@@ -138,7 +138,7 @@ def _decide(
 ) -> tuple[Evidence, Selection | None]:
     """Compute the evidence that the components need, and select those that are open; report each decision."""
     began, settings = time.perf_counter(), inputs.settings
-    evidence = collect_evidence(photos, inputs.pool, inputs.extent, settings=settings, is_new=is_new, notify=notify)
+    evidence = collect_evidence(photos, inputs.pool, settings=settings, is_new=is_new, notify=notify)
     if not is_new or settings.model != "auto":
         return evidence, None
     selection = _select(inputs, evidence, _facts(photos, settings, evidence), began=began, notify=notify)

@@ -271,7 +271,7 @@ class Refinement(nn.Module):
             self.lenses.step(by_lens, LENS_RATE * rate)
 
     def frames(
-        self, training: Sequence[Frame], held_out: Sequence[Frame], *, scale: float
+        self, training: Sequence[Frame], held_out: Sequence[Frame]
     ) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
         """Return both sets of frames refined: the poses of training photos, and the lenses of all photos.
 
@@ -280,7 +280,6 @@ class Refinement(nn.Module):
         Args:
             training: frames of the photos of the pool, in its order; their pictures may have another size.
             held_out: further frames, of the same size as `training`.
-            scale: units of the training frame per scene unit.
         """
         photo_of = {frame.camera.centred(): index for index, frame in enumerate(training)}
 
@@ -292,7 +291,7 @@ class Refinement(nn.Module):
         poses = [frame.world_from_cam for frame in training]
         if self.poses is not None:
             motions = self.poses.motions.numpy()
-            motions = from_parts(motions[:, :3, :3], motions[:, :3, 3] / scale)
+            motions = from_parts(motions[:, :3, :3], motions[:, :3, 3] / self._pool.training_from_scene.scale)
             poses = [pose @ motion for pose, motion in zip(poses, motions, strict=True)]
         return (
             tuple(refined(frame, pose) for frame, pose in zip(training, poses, strict=True)),

@@ -100,19 +100,16 @@ class Fit:
         return _log_ratios(points, z, self.registration, self.scale) + math.log(self.scale)
 
 
-def sensor_depths(
-    known: PointDepths, pool: PixelPool, *, training_scale: float, notify: Callable[[str], None]
-) -> list[DenseDepth]:
+def sensor_depths(known: PointDepths, pool: PixelPool, *, notify: Callable[[str], None]) -> list[DenseDepth]:
     """Return the pixels of each photo whose depth a sensor has measured; none if the photos do not confirm it.
 
     error = spread max(1, z / median z) / confidence
 
     Args:
         known: pixels whose distance is known from photos.
-        training_scale: units of the training frame per scene unit.
         notify: receives what is used, the agreement, and what is left out.
     """
-    points, unreadable = seen_points(known, pool, training_scale=training_scale), dict[str, str]()
+    points, unreadable = seen_points(known, pool), dict[str, str]()
     measured = [i for i, frame in enumerate(pool.frames) if frame.depth is not None and not frame.camera.is_spherical]
     sample = [measured[i] for i in np.unique(np.linspace(0, len(measured) - 1, MOST_PHOTOS).round().astype(int))]
     fit = fitted([(points[i], readings.z) for i, readings in _read(pool, sample, unreadable)])
@@ -179,7 +176,7 @@ def _read(pool: PixelPool, chosen: Sequence[int], unreadable: dict[str, str]) ->
             unreadable[frame.name] = error.message
 
 
-def seen_points(known: PointDepths, pool: PixelPool, *, training_scale: float) -> list[SeenPoints]:
+def seen_points(known: PointDepths, pool: PixelPool) -> list[SeenPoints]:
     """Return known distances as the points of each photo."""
     numbers, distances = known.numbers.cpu().numpy(), known.distances.cpu().numpy().astype(np.float64)
     by_photo = indices_by_value(pool.photo_of(known.numbers).cpu().numpy(), len(pool.cameras))
@@ -187,7 +184,7 @@ def seen_points(known: PointDepths, pool: PixelPool, *, training_scale: float) -
     for camera, first, own in zip(pool.cameras, pool.first_pixel.tolist(), by_photo, strict=True):
         row, column = np.divmod(numbers[own] - first, camera.width)
         pixels = np.stack([column, row], axis=-1) + 0.5
-        z = distances[own] * _cosines(camera, pixels) / training_scale
+        z = distances[own] * _cosines(camera, pixels) / pool.training_from_scene.scale
         found.append(SeenPoints((pixels / camera.size)[z > 0], z[z > 0]))
     return found
 
