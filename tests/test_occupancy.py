@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels import backend_for
+from nerfcli.render.trained_field import Marching
 from nerfcli.training.open_cells import DECAY, Occupancy, training_points
 
 SIDE = 4
@@ -60,7 +61,8 @@ class Even(Fake):
 
 def refreshed(grid: Occupancy, field: Any, *, cells: slice = EVERYTHING, step: float = 0.5, growth: float = 0.0):
     generator = torch.Generator().manual_seed(1)
-    grid.refresh(field, detail=0.25, cells=cells, shortest_step=step, growth=growth, generator=generator)
+    marching = Marching(near=0.1, far=10.0, shortest_step=step, growth=growth)
+    grid.refresh(field, marching, detail=0.25, cells=cells, generator=generator)
     assert field.detail == 0.25
     return grid
 

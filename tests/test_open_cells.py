@@ -41,12 +41,12 @@ class Slab:
 
 
 def cells_of(field: Any) -> OpenCells:
-    return OpenCells(field, CPU)
+    return OpenCells(field, MARCHING, CPU)
 
 
 def refresh(cells: OpenCells, step: int) -> None:
     generator = torch.Generator().manual_seed(step)
-    cells.refresh(step, threshold=THRESHOLD, detail=1.0, marching=MARCHING, generator=generator)
+    cells.refresh(step, threshold=THRESHOLD, detail=1.0, generator=generator)
 
 
 def visit(cells: OpenCells, where: tuple[int, int, int], depth: float) -> None:

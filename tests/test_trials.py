@@ -4,7 +4,6 @@ import itertools
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,6 +33,12 @@ def inputs_of(scene: Capture) -> TrainingInputs:
     extent = choose_extent(scene, SETTINGS, is_object=True)
     photos = load_photos(scene.train_frames, factor=4, threads=1)
     return TrainingInputs(SETTINGS, extent, PixelPool(photos, extent.training_from_scene, torch.device("cpu")))
+
+
+def fitting_of(trials: Trials, components: Components, cameras_from: float = 0.0) -> Fitting:
+    """Return a fresh training on the pixels of trials."""
+    settings = replace(trials._inputs.settings, components=components)
+    return Fitting(replace(trials._inputs, settings=settings), cameras_from=cameras_from)
 
 
 @pytest.fixture(scope="module")
@@ -99,20 +104,19 @@ def test_a_start_that_cannot_come_to_the_fewest_steps_ends_at_once(trials, monke
 
 def test_a_trial_has_its_cameras_learn_from_the_fork_on(trials, start, monkeypatch):
     begun: list[float] = []
-    make = Trials._fitting
 
-    def fitting(self: Trials, components: Components, *, cameras_from: float, **others: Any) -> Fitting:
+    def fitting(inputs: TrainingInputs, *, cameras_from: float) -> Fitting:
         begun.append(cameras_from)
-        return make(self, components, cameras_from=cameras_from, **others)
+        return Fitting(inputs, cameras_from=cameras_from)
 
-    monkeypatch.setattr(Trials, "_fitting", fitting)
+    monkeypatch.setattr("nerfcli.training.trials.Fitting", fitting)
     trials.go_on(start, Components(view=0), seed=0, steps=0)
     assert begun == [0.02]  # where the start forked
 
 
 def test_the_learning_rate_falls_by_half_a_cosine_after_its_warm_up(trials):
     """Values by hand: from 0.01 to 0.001, the mean of both halfway."""
-    fitting = trials._fitting(Components(view=0), seed=0, log_gains=None, cameras_from=0.0)
+    fitting = fitting_of(trials, Components(view=0))
     assert fitting.schedule.learning_rate(0.0, step=0) == pytest.approx(0.01 / 50)
     rates = [fitting.schedule.learning_rate(progress, step=1000) for progress in (0.0, 0.25, 0.5, 1.0, 1.5)]
     assert rates == pytest.approx([0.01, 0.001 + 0.009 * (0.5 + 0.125**0.5), 0.0055, 0.001, 0.001])
@@ -122,7 +126,7 @@ def test_trials_have_the_small_tables_of_short_trainings(spheres):
     for given, used in ((18, 16), (8, 8)):
         inputs = inputs_of(spheres)
         trials = Trials(replace(inputs, settings=replace(SETTINGS, log2_rows=given)))
-        fitting = trials._fitting(Components(view=0), seed=0, log_gains=None, cameras_from=0.0)
+        fitting = fitting_of(trials, Components(view=0))
         assert fitting.field.settings.to_json()["log2_rows"] == used
 
 
@@ -135,18 +139,20 @@ def test_large_tables_have_their_levels_by_steps(trials, monkeypatch, rows_of_la
     move; but learned cameras keep the field coarse at first."""
     monkeypatch.setattr("nerfcli.field.hash_field.DETAILED_LOG2_ROWS", rows_of_large)
     monkeypatch.setattr("nerfcli.training.schedule.LARGE_TABLE_STEPS", 4)
-    fitting = trials._fitting(Components(view=0, cameras=cameras), seed=0, log_gains=None, cameras_from=0.0)
-    fresh = fitting.field.rows().detach().clone()
+    fitting = fitting_of(trials, Components(view=0, cameras=cameras))
+    rows = fitting.field.rows()
+    assert rows is not None
+    fresh = rows.detach().clone()
     moved = []
     for _ in learning:
         fitting.advance(0.0)
-        moved.append(int((fitting.field.rows() != fresh).any(2).any(1).sum()))
+        moved.append(int((rows != fresh).any(2).any(1).sum()))
     assert moved == learning
 
 
 def test_cameras_learn_from_the_fork_on(trials, start):
     """A step at the fork, after 0.6 of the budget, does not move the cameras; a later one does."""
-    fitting = trials._fitting(Components(view=0, cameras="poses"), seed=0, log_gains=None, cameras_from=0.6)
+    fitting = fitting_of(trials, Components(view=0, cameras="poses"), cameras_from=0.6)
     trials._take_up(fitting, start)
     assert fitting.appearance.cameras is not None
     assert fitting.appearance.cameras.poses is not None
@@ -164,7 +170,7 @@ def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkey
     the middle of the last step before the given distance."""
     inputs = inputs_of(spheres)
     trials = Trials(replace(inputs, extent=replace(inputs.extent, contraction="l2")))
-    fitting = trials._fitting(Components(view=0), seed=0, log_gains=None, cameras_from=0.0)
+    fitting = fitting_of(trials, Components(view=0))
     monkeypatch.setattr(fitting.ray_steps, "edges", lambda stride: torch.linspace(0.1, 1.4, 14))
     sigma = 0.1
 
@@ -185,7 +191,7 @@ def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkey
 def test_trials_use_the_lens_found_before(spheres):
     """Matches give focal lengths 5 % longer: learned lenses start from these, so their rays are closer together."""
     trials = Trials(replace(inputs_of(spheres), log_focal=math.log(1.05)))
-    fitting = trials._fitting(Components(cameras="focal"), seed=0, log_gains=None, cameras_from=0.0)
+    fitting = fitting_of(trials, Components(cameras="focal"))
     drawn = trials._pool.rays_of(torch.tensor([0, trials._pool.cameras[0].width - 1]))
 
     def width(directions: torch.Tensor) -> float:

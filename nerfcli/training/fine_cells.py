@@ -68,11 +68,10 @@ def _are_empty(model: Model, cells: Tensor) -> Tensor:
     """Return whether nothing is at the examined points of each cell, given by number (z * SIDE + y) * SIDE + x."""
     generator = torch.Generator(model.device).manual_seed(0)
     places = torch.stack([cells % SIDE, cells // SIDE % SIDE, cells // SIDE**2], dim=-1)
-    empty, march = torch.ones_like(cells, dtype=torch.bool), model.marching
+    empty = torch.ones_like(cells, dtype=torch.bool)
     for part in torch.cartesian_prod(*[torch.arange(PARTS, device=model.device)] * 3):
         left = empty.nonzero()[:, 0]
         inside = torch.rand(len(left), 3, generator=generator, device=model.device)
         coordinates = (places[left] + (part + inside) / PARTS) / SIDE
-        depths = step_depths(model.field, coordinates, shortest_step=march.shortest_step, growth=march.growth)
-        empty[left] = depths <= EMPTY  # False at NaN
+        empty[left] = step_depths(model.field, coordinates, model.marching) <= EMPTY  # False at NaN
     return empty

@@ -123,7 +123,7 @@ class Fitting:
             has_large_table=self.field.settings.detailed,
             closing_steps=self.field.closing_steps,
         )
-        self.cells = OpenCells(self.field, device)
+        self.cells = OpenCells(self.field, self.extent.marching, device)
         if sky is not None:
             self.appearance.init_background_from_sky(sky)
         self.ray_steps = RaySteps(self.extent, self.field.settings, device)
@@ -172,13 +172,7 @@ class Fitting:
 
     def draw(self, plan: StepPlan) -> PixelBatch:
         """Return the pixels of the next step; refresh the open cells first if it is time."""
-        self.cells.refresh(
-            self.step,
-            threshold=plan.threshold,
-            detail=plan.detail,
-            marching=self.extent.marching,
-            generator=self.generator,
-        )
+        self.cells.refresh(self.step, threshold=plan.threshold, detail=plan.detail, generator=self.generator)
         rays = min(self._most_rays, max(64, round(plan.samples / max(1.0, self.samples_per_ray))))
         drawn = self.pool.draw(rays, self.generator)
         if self.points is None or "points" not in plan.weights:

@@ -37,19 +37,18 @@ def training_points(coordinates: Tensor, contraction: str) -> Tensor:
     return uncontract((coordinates - 0.5) * 4.0)
 
 
-def step_depths(
-    field: Field, coordinates: Tensor, *, detail: float = 1.0, shortest_step: float, growth: float
-) -> Tensor:
+def step_depths(field: Field, coordinates: Tensor, marching: Marching, *, detail: float = 1.0) -> Tensor:
     """Return the optical depth of a step of a ray at points (N, 3) of the unit cube, (N,); without gradients.
 
     Args:
+        marching: its distances are from the origin of the training frame, near which the cameras are.
         detail: level of detail of the field, see `Field.medium`.
-        shortest_step, growth: the steps of `Marching`, with the distance from the origin of the training frame.
     """
     medium = field.medium(detail)
     density = torch.cat([field.backend.density(chunk, medium) for chunk in coordinates.split(2**16)])
     radius = training_points(coordinates, field.settings.contraction).norm(dim=-1)
-    return density * (growth * radius * radius.clamp_min(1.0)).clamp_min(shortest_step)  # as in `Marching.edges`
+    steps = marching.growth * radius * radius.clamp_min(1.0)  # as in `Marching.edges`
+    return density * steps.clamp_min(marching.shortest_step)
 
 
 DECAY = 0.8
@@ -83,23 +82,14 @@ class Occupancy:
 
     @torch.no_grad()
     def refresh(
-        self,
-        field: Field,
-        *,
-        detail: float,
-        cells: slice,
-        shortest_step: float,
-        growth: float,
-        generator: torch.Generator,
+        self, field: Field, marching: Marching, *, detail: float, cells: slice, generator: torch.Generator
     ) -> None:
         """Evaluate the field at one random point in each of the chosen cells.
 
         Args:
-            detail: level of detail of the field, see `Field.medium`.
+            marching, detail: see `step_depths`.
             cells: slice of the cells, numbered (z * side + y) * side + x; in this order their features are close in
                 memory.
-            shortest_step, growth: the step schedule of `Marching`; distances are from the origin of the
-                training frame, near which the cameras are.
             generator: source of the random points, on the grid's device.
         """
         side, device = self.optical_depth.shape[0], self.optical_depth.device
@@ -107,7 +97,7 @@ class Occupancy:
         place = torch.stack([numbers % side, numbers // side % side, numbers // side**2], dim=-1)
         inside = torch.rand(len(numbers), 3, generator=generator, device=device)
         coordinates = (place + inside) / side
-        depths = step_depths(field, coordinates, detail=detail, shortest_step=shortest_step, growth=growth)
+        depths = step_depths(field, coordinates, marching, detail=detail)
         chosen = self.optical_depth.view(-1)[cells]
         chosen.copy_(torch.maximum(torch.where(chosen.isinf(), 0.0, chosen * DECAY), depths))
 
@@ -137,8 +127,8 @@ class OpenCells:
     which these samples were empty; a coarse cell is open as long as they find something in one of its fine cells.
     """
 
-    def __init__(self, field: Field, device: torch.device):
-        self._field = field
+    def __init__(self, field: Field, marching: Marching, device: torch.device):
+        self._field, self._marching = field, marching
         self._occupancy = Occupancy(OCCUPANCY_SIDE, device)
         # Fine cells: the largest optical depth of the samples since the last refresh, and the value up to then.
         self.cell_depths: Tensor | None = None
@@ -165,15 +155,7 @@ class OpenCells:
         blocks = fine.view(OCCUPANCY_SIDE, parts, OCCUPANCY_SIDE, parts, OCCUPANCY_SIDE, parts)
         return self.coarse & blocks.any(5).any(3).any(1)
 
-    def refresh(
-        self,
-        step: int,
-        *,
-        threshold: float,
-        detail: float,
-        marching: Marching,
-        generator: torch.Generator,
-    ) -> None:
+    def refresh(self, step: int, *, threshold: float, detail: float, generator: torch.Generator) -> None:
         """Update the open cells from the field, every few steps.
 
         Args:
@@ -187,10 +169,9 @@ class OpenCells:
         turn = step // REFRESH_EVERY
         self._occupancy.refresh(
             self._field,
+            self._marching,
             detail=detail,
             cells=slice(None) if turn == 1 else slice(turn % REFRESH_TURNS, None, REFRESH_TURNS),
-            shortest_step=marching.shortest_step,
-            growth=marching.growth,
             generator=generator,
         )
         if self.cell_depths is not None:

@@ -235,7 +235,8 @@ class Trials:
             The state; None if there were fewer than the fewest steps.
         """
         gains = self._inputs.log_gains if components.exposure in ("matched", "learned") else None
-        fitting = self._fitting(components, seed=self._inputs.settings.seed, log_gains=gains, cameras_from=0.0)
+        settings = replace(self._inputs.settings, components=components)
+        fitting = Fitting(replace(self._inputs, settings=settings, log_gains=gains))
         took: list[float] = []
         seconds = math.inf if budget.seconds is None else budget.seconds
 
@@ -282,7 +283,8 @@ class Trials:
         matched = self._inputs.log_gains
         learned = start.signs.log_gains if matched is None else matched
         gains = {"exif": self._exif, "matched": matched, "learned": learned}.get(components.exposure)
-        fitting = self._fitting(components, seed=seed, log_gains=gains, cameras_from=FORK_PROGRESS)
+        settings = replace(self._inputs.settings, components=components, seed=seed)
+        fitting = Fitting(replace(self._inputs, settings=settings, log_gains=gains), cameras_from=FORK_PROGRESS)
         self._take_up(fitting, start)
         if fitting.appearance.background is not None:
             paint(fitting.appearance.background, self._draws())
@@ -313,10 +315,6 @@ class Trials:
             return drawn.directions[shown], drawn.colours[shown, :3]
 
         return seen
-
-    def _fitting(self, components: Components, *, seed: int, log_gains: Tensor | None, cameras_from: float) -> Fitting:
-        settings = replace(self._inputs.settings, components=components, seed=seed)
-        return Fitting(replace(self._inputs, settings=settings, log_gains=log_gains), cameras_from=cameras_from)
 
     def _take_up(self, fitting: Fitting, start: TrialStart) -> None:
         """Bring a fresh training to `start`, except for its random numbers and the parts besides the field."""
