@@ -61,6 +61,9 @@ class FourierField(Field):
             self.log_density.weight.mul_(0.1)
         self.colour = nn.Sequential(_linear(width + HARMONICS, width // 2), nn.ReLU(), _linear(width // 2, 3))
 
+    def medium(self, detail: float = 1.0) -> "FourierField":
+        return self
+
     def density(self, coordinates: Tensor) -> Tensor:
         """See `kernels.Medium`."""
         return density_from_log(self.log_density(self._hidden(coordinates))[:, 0])

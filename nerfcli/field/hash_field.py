@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from nerfcli.field.interface import Field, FieldSettings
-from nerfcli.kernels import HashGrid, reference, spherical_harmonics
+from nerfcli.kernels import HashGrid
 
 # Outputs of the density network, the log density first; all of them are inputs of the colour network.
 GEOMETRY = 16
@@ -80,7 +80,9 @@ class HashField(Field):
         shape = (settings.levels, 2**settings.log2_rows, settings.features)
         self.table = nn.Parameter(torch.empty(shape).uniform_(-1e-4, 1e-4))
         sizes = ((width, encoded), (GEOMETRY, width), (width, GEOMETRY + HARMONICS), (width, width), (3, width))
-        self.weights = nn.ParameterList([_uniform_weights(*size) for size in sizes])
+        # They keep the variance of rectified inputs.
+        weights = (nn.Parameter(torch.empty(size)) for size in sizes)
+        self.weights = nn.ParameterList(nn.init.kaiming_uniform_(weight, nonlinearity="relu") for weight in weights)
 
     def rows(self) -> nn.Parameter:
         return self.table
@@ -94,16 +96,6 @@ class HashField(Field):
             self.settings.antialias,
             self.table_grad,
         )
-
-    def density(self, coordinates: Tensor) -> Tensor:
-        """See `kernels.Medium`; without gradients."""
-        return self.backend.density(coordinates, self.medium())
-
-    def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-        """See `kernels.Medium`. Backends render the `HashGrid` itself faster."""
-        grid = self.medium()
-        encoded = self.backend.hash_encode(coordinates, grid.table, grid.resolutions, table_grad=self.table_grad)
-        return reference.radiance(encoded, spherical_harmonics(directions, grid.view_degree), rays, grid.layers)
 
     @torch.no_grad()
     def forget_directions(self, degree: int) -> None:
@@ -121,12 +113,3 @@ def _resolutions_at(detail: float, resolutions: tuple[int, ...]) -> tuple[int, .
     """Return the resolutions of the levels that learn with a detail, and 0 for the others."""
     learning = learning_levels(detail, len(resolutions))
     return tuple(side if level < learning else 0 for level, side in enumerate(resolutions))
-
-
-def _uniform_weights(outputs: int, inputs: int) -> nn.Parameter:
-    """Return weights that keep the variance of rectified inputs: uniform within sqrt(6 / inputs).
-
-    Source: He et al. 2015, arXiv:1502.01852, eq. 10.
-    """
-    bound = math.sqrt(6.0 / inputs)
-    return nn.Parameter(torch.empty(outputs, inputs).uniform_(-bound, bound))

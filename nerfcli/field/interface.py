@@ -86,6 +86,7 @@ class Field(nn.Module, abc.ABC):
         """
         return None
 
+    @abc.abstractmethod
     def medium(self, detail: float = 1.0) -> kernels.HashGrid | kernels.Medium:
         """Return the medium that backends render.
 
@@ -93,12 +94,3 @@ class Field(nn.Module, abc.ABC):
             detail: fraction of the details that a training adds, which the field includes; 1 or more for all, below 0
                 for fewer than at the start. Details left out are as in an untrained field: nothing visible.
         """
-        return self
-
-    @abc.abstractmethod
-    def density(self, coordinates: Tensor) -> Tensor:
-        """Return the density of points; see `kernels.Medium`."""
-
-    @abc.abstractmethod
-    def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-        """Return density and colour of points; see `kernels.Medium`."""

@@ -68,6 +68,9 @@ class VoxelField(Field):
     def rows(self) -> nn.Parameter:
         return self.table
 
+    def medium(self, detail: float = 1.0) -> "VoxelField":
+        return self
+
     def density(self, coordinates: Tensor) -> Tensor:
         """See `kernels.Medium`."""
         # The log density is in the first table; the other tables are not needed.
