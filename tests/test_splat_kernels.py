@@ -19,7 +19,6 @@ from nerfcli.kernels.numba_cpu.splats import (
     SplatPicture,
     render_splats,
     splat_depths,
-    splat_gradients,
     step_splats,
 )
 from nerfcli.kernels.reference.splats import composite_splats, project_splats
@@ -55,6 +54,15 @@ def random_rows(count: int, degree: int, *, seed: int = 0) -> np.ndarray:
         0.3 * rng.normal(size=(count, 3 * (degree + 1) ** 2)),
     ]
     return np.concatenate(parts, axis=1).astype(np.float32)
+
+
+def gradients_of(picture: SplatPicture, by_image: np.ndarray, by_transmittance: np.ndarray) -> np.ndarray:
+    """Return d loss / d rows: the first moment of a step of Adam that forgets all earlier ones, and changes nothing."""
+    count = len(picture.rows)
+    adam = SplatAdam(np.zeros_like(picture.rows), np.zeros_like(picture.rows), np.zeros(count, np.int32))
+    rates, sizes = np.zeros(6, np.float32), np.zeros(count, np.float32)
+    step_splats(picture, by_image, by_transmittance, adam, rates=rates, sizes=sizes, betas=(0.0, 0.0))
+    return adam.first
 
 
 def row(mean: tuple[float, ...], size: float, opacity: float, colour: tuple[float, ...]) -> np.ndarray:
@@ -122,7 +130,7 @@ def test_compiled_kernels_agree_with_the_definition(camera: Camera, count: int, 
     by_image, by_light = rng.normal(size=(HEIGHT, WIDTH, 3)), rng.normal(size=(HEIGHT, WIDTH))
     loss = (colour * torch.from_numpy(by_image)).sum() + (transmittance * torch.from_numpy(by_light)).sum()
     wanted = torch.autograd.grad(loss, list(leaves))
-    found = splat_gradients(picture, by_image, by_light)
+    found = gradients_of(picture, by_image, by_light)
     parts = (found[:, :3], found[:, 3:6], found[:, 6:10], found[:, 10], found[:, 11:].reshape(count, -1, 3))
     for part, truth in zip(parts, wanted, strict=True):
         np.testing.assert_allclose(part, truth, atol=CLOSE_GRADIENT * float(truth.abs().max()) + 1e-12)
@@ -178,7 +186,7 @@ def test_opacity_is_limited_and_then_has_no_gradient() -> None:
     assert picture.transmittance[25, 35] == pytest.approx(1 - LARGEST_ALPHA, abs=1e-6)
     only_there = np.zeros((HEIGHT, WIDTH), np.float32)
     only_there[25, 35] = 1.0
-    gradient = splat_gradients(picture, np.zeros_like(picture.image), only_there)
+    gradient = gradients_of(picture, np.zeros_like(picture.image), only_there)
     np.testing.assert_array_equal(gradient[0, :11], 0.0)
 
 
@@ -189,7 +197,7 @@ def test_every_number_of_threads_gives_the_same_bits() -> None:
         for threads in (1, 2):
             torch.set_num_threads(threads)
             picture = render_splats(rows, view, BACKGROUND)
-            results.append((picture.image, splat_gradients(picture, picture.image, picture.transmittance)))
+            results.append((picture.image, gradients_of(picture, picture.image, picture.transmittance)))
     finally:
         torch.set_num_threads(before)
     for one, two in zip(*results, strict=True):
@@ -202,7 +210,7 @@ def test_nothing_to_show_is_the_background() -> None:
     for rows in (np.zeros((0, 14), np.float32), np.stack([behind, beyond, faint])):
         picture = render_splats(rows, facing(), BACKGROUND)
         np.testing.assert_allclose(picture.image, np.broadcast_to(BACKGROUND, picture.image.shape), rtol=1e-6)
-        assert not splat_gradients(picture, picture.image, picture.transmittance).any()
+        assert not gradients_of(picture, picture.image, picture.transmittance).any()
         assert splat_depths(picture, (0.5,)).mean.isnan().all()
 
 
@@ -233,7 +241,7 @@ def stepped(rows: np.ndarray, picture: SplatPicture) -> SplatAdam:
 
 
 def test_steps_are_those_of_adam_on_what_is_seen() -> None:
-    """Two steps with torch's Adam on the gradients of `splat_gradients`; the rate of means is in their sizes."""
+    """Two steps with torch's Adam on the gradients of `gradients_of`; the rate of means is in their sizes."""
     rows, view = random_rows(60, 1), view_of(OPENCV)
     rates = np.array([0.1, 0.04, 0.02, 0.2, 0.04, 0.01], np.float32)
     sizes = np.linspace(0.5, 2.0, 60, dtype=np.float32)
@@ -243,7 +251,7 @@ def test_steps_are_those_of_adam_on_what_is_seen() -> None:
     columns = np.repeat(rates, [3, 3, 4, 1, 3, 9])
     for _ in range(2):
         picture = render_splats(rows, view, BACKGROUND)
-        gradients = splat_gradients(picture, picture.image, picture.transmittance)
+        gradients = gradients_of(picture, picture.image, picture.transmittance)
         before = rows.copy()
         step_splats(picture, picture.image, picture.transmittance, adam, rates=rates, sizes=sizes, betas=(0.9, 0.99))
         for index in range(60):

@@ -100,16 +100,6 @@ def splat_depths(picture: SplatPicture, fractions: tuple[float, ...]) -> RayTerm
     return RayTermination(opacity, transmittance, mean, spread, peak, largest, values[:, 6:])
 
 
-def splat_gradients(picture: SplatPicture, by_image: np.ndarray, by_transmittance: np.ndarray) -> np.ndarray:
-    """Return d loss / d rows (N, 11 + 3 K) float32, given d loss / d image and / d transmittance; 0 where unseen."""
-    gradients = np.zeros_like(picture.rows)
-    sums = _sums(picture, by_image, by_transmittance)
-    _gradients(
-        picture.rows, picture.order, picture.footprints, picture.first_slots, sums, _camera(picture.view), gradients
-    )
-    return gradients
-
-
 def step_splats(
     picture: SplatPicture,
     by_image: np.ndarray,
@@ -123,11 +113,16 @@ def step_splats(
     """Take a step of Adam on the Gaussians that the picture shows, in place.
 
     Args:
-        by_image, by_transmittance: see `splat_gradients`.
+        by_image, by_transmittance: d loss / d image and d loss / d transmittance.
         rates: (6,) of means in units of `sizes`, log scales, quaternions, logits, harmonics of degree 0, of the others.
         sizes: (N,).
     """
-    sums = _sums(picture, by_image, by_transmittance)
+    sums = np.empty((len(picture.entries), SUMS), np.float32)
+    splat_compositing.backward(
+        picture.starts, picture.ends, picture.entries, picture.slots, picture.footprints, picture.boxes,
+        picture.image, picture.transmittance, np.ascontiguousarray(by_image, np.float32),
+        np.ascontiguousarray(by_transmittance, np.float32), sums, use_threads(),
+    )  # fmt: skip
     columns = np.empty(picture.rows.shape[1], np.float32)
     parts = (MEAN, SCALE, QUATERNION, LOGIT, COLOUR, COLOUR + 3, len(columns))
     for rate, first, last in zip(rates, parts[:-1], parts[1:], strict=True):
@@ -142,40 +137,6 @@ def _camera(view: SplatView) -> tuple[Any, ...]:
     return view.rotation, view.translation, view.table, view.first, view.step
 
 
-def _sums(picture: SplatPicture, by_image: np.ndarray, by_transmittance: np.ndarray) -> np.ndarray:
-    sums = np.empty((len(picture.entries), SUMS), np.float32)
-    splat_compositing.backward(
-        picture.starts, picture.ends, picture.entries, picture.slots, picture.footprints, picture.boxes,
-        picture.image, picture.transmittance, np.ascontiguousarray(by_image, np.float32),
-        np.ascontiguousarray(by_transmittance, np.float32), sums, use_threads(),
-    )  # fmt: skip
-    return sums
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _gather(
-    begin: Any, end: Any, rows: Any, order: Any, footprints: Any, first_slots: Any, sums: Any, camera: Any,
-    scratch: Any, buffer: Any,
-) -> None:  # fmt: skip
-    """Compute the gradients of Gaussians `begin` to `end` in the order, at most `LANES`, in the lanes of the buffer."""
-    for i in range(begin, end):
-        own = sums[first_slots[i] : first_slots[i + 1]]
-        gather_lane(i - begin, rows[order[i]], footprints[i], own, camera, scratch, buffer)
-    gradients_of_lanes(buffer, degree_of(rows.shape[1]), camera[0])
-
-
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _gradients(rows: Any, order: Any, footprints: Any, first_slots: Any, sums: Any, camera: Any, out: Any) -> None:
-    for block in numba.prange((len(order) + _BLOCK - 1) // _BLOCK):
-        buffer, scratch = np.zeros(BUFFER, np.float32), (np.empty(3), np.empty(12), np.empty(6), np.empty(6))
-        for begin in range(block * _BLOCK, min(len(order), (block + 1) * _BLOCK), LANES):
-            end = min(len(order), begin + LANES)
-            _gather(begin, end, rows, order, footprints, first_slots, sums, camera, scratch, buffer)
-            for i in range(begin, end):
-                for k in range(rows.shape[1]):
-                    out[order[i], k] = gradient_of_lane(buffer, i - begin, k)
-
-
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
 def _step(
     rows: Any, order: Any, footprints: Any, first_slots: Any, sums: Any, camera: Any, moments: Any, squares: Any,
@@ -187,7 +148,10 @@ def _step(
         gradient, change = np.empty(columns, np.float32), np.empty(columns, np.float32)
         for begin in range(block * _BLOCK, min(len(order), (block + 1) * _BLOCK), LANES):
             end = min(len(order), begin + LANES)
-            _gather(begin, end, rows, order, footprints, first_slots, sums, camera, scratch, buffer)
+            for i in range(begin, end):
+                own = sums[first_slots[i] : first_slots[i + 1]]
+                gather_lane(i - begin, rows[order[i]], footprints[i], own, camera, scratch, buffer)
+            gradients_of_lanes(buffer, degree_of(columns), camera[0])
             for i in range(begin, end):
                 n, total = order[i], np.float32(0.0)
                 for k in range(columns):
@@ -222,7 +186,6 @@ def prepare_splats(notify: Callable[[str], None]) -> None:
     picture = render_splats(rows, view, np.zeros(3))
     nothing = np.zeros_like(picture.image)
     splat_depths(picture, (0.5,))
-    splat_gradients(picture, nothing, picture.transmittance)
     adam = SplatAdam(np.zeros_like(rows), np.zeros_like(rows), np.zeros(1, np.int32))
     rates, sizes = np.zeros(6, np.float32), np.zeros(1, np.float32)
     by_image = similarity_gradient(picture.image, nothing)
