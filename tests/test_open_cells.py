@@ -11,6 +11,7 @@ from torch import Tensor
 from nerfcli import distributed, kernels
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.kernels import March, Rays, numba_cpu, reference
+from nerfcli.kernels.numba_cpu.backend import NumbaBackend
 from nerfcli.render.trained_field import Marching
 from nerfcli.training.open_cells import FINE_SIDE, OCCUPANCY_SIDE, REFRESH_EVERY, REFRESH_TURNS, OpenCells
 from nerfcli.training.schedule import THRESHOLD
@@ -84,14 +85,14 @@ def test_nan_is_no_value_and_no_sample_changes_nothing(name):
     assert cells[1, 1, 1] == 0.7
 
 
-@pytest.mark.parametrize("wanted", ["reference", "numba_cpu"])
-def test_rendering_notes_the_optical_depths_of_its_samples(wanted):
+@pytest.mark.parametrize("backend", [kernels.Backend, NumbaBackend])
+def test_rendering_notes_the_optical_depths_of_its_samples(backend):
     """Against the samples that a step shows to `trace`."""
     torch.manual_seed(0)
     field = HashField(HashFieldSettings(contraction="l2", log2_rows=8, coarsest=4, finest=16))
     with torch.no_grad():
         field.table.normal_(0.0, 0.5)
-    field.backend = kernels.backend_for(CPU, torch.float32, wanted=wanted)
+    field.backend = backend(CPU)
     origins, directions = torch.zeros(9, 3), torch.nn.functional.normalize(torch.randn(9, 3), dim=-1)
     edges = torch.linspace(0.0, 2.0, 22)  # steps of 2/21
     march = March(edges, torch.ones(4, 4, 4, dtype=torch.bool), "l2", 5.0)

@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 
-from nerfcli.errors import UserError
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.kernels.composition import Backend
 from nerfcli.kernels.contraction import CONTRACTIONS, contract, grid_coordinates
@@ -36,27 +35,27 @@ from nerfcli.kernels.interface import (
 from nerfcli.kernels.reference import distances_to_occupied, ray_indices, sum_along_rays
 from nerfcli.version import __version__
 
-BACKENDS = ("auto", "reference", "numba_cpu", "triton_cuda")
 
-
-def backend_for(device: torch.device, dtype: torch.dtype, *, wanted: str = "auto") -> Backend:
-    """Choose the backend that computes a field.
+def backend_for(device: torch.device, dtype: torch.dtype) -> Backend:
+    """Choose the fastest backend that supports a field, and warn once if the fast one of its device does not work.
 
     Args:
         device, dtype: of the field's parameters.
-        wanted: one of `BACKENDS`; auto takes the fastest one that supports the field, and warns once if the fast
-            backend of this device does not work.
-
-    Raises:
-        ValueError: there is no backend of this name.
-        UserError: the backend wanted by name does not work on this machine, or not for this device and dtype.
     """
-    if wanted not in BACKENDS:
-        raise ValueError(f"backend must be one of {BACKENDS}, got {wanted!r}")
-    fast, why_not = _fast_backend(device, dtype, wanted)
-    if fast is None and wanted in ("numba_cpu", "triton_cuda"):
-        raise UserError(f"the backend {wanted} cannot be used: {why_not}", "use auto or reference")
-    return fast or Backend(device)
+    # float64 fields are for comparison with the reference: no warning is due that they run on plain torch.
+    if device.type == "cuda" and dtype != torch.float64:
+        why_not = triton_unavailable_reason(device)
+        if why_not is None and dtype == torch.float32:
+            from nerfcli.kernels.triton_cuda.backend import TritonBackend
+
+            return TritonBackend(device)
+        if torch.cuda.is_available():
+            _warn_of_slow_gpu(why_not or f"float32 is supported, not {str(dtype).removeprefix('torch.')}")
+    if device.type == "cpu" and dtype == torch.float32 and _numba_cpu() is not None:
+        from nerfcli.kernels.numba_cpu.backend import NumbaBackend
+
+        return NumbaBackend(device)
+    return Backend(device)
 
 
 def triton_unavailable_reason(device: torch.device) -> str | None:
@@ -124,36 +123,6 @@ def _warm_up_cpu() -> None:
     numba_cpu.warm_up()
 
 
-def _fast_backend(device: torch.device, dtype: torch.dtype, wanted: str) -> tuple[Backend | None, str | None]:
-    """Return the compiled backend for a device and dtype, or why there is none."""
-    # float64 fields are for comparison with the reference: no warning is due that they run on plain torch.
-    if wanted == "triton_cuda" or (wanted == "auto" and device.type == "cuda" and dtype != torch.float64):
-        return _triton_backend(device, dtype, wanted)
-    if wanted == "numba_cpu" or (wanted == "auto" and device.type == "cpu" and dtype == torch.float32):
-        if _numba_cpu() is None:
-            return None, "Numba does not work on this machine"
-        if device.type != "cpu" or dtype != torch.float32:
-            given = f"{str(dtype).removeprefix('torch.')} on {device.type}"
-            return None, f"it supports float32 on the CPU only, not {given}"
-        from nerfcli.kernels.numba_cpu.backend import NumbaBackend
-
-        return NumbaBackend(device), None
-    return None, None
-
-
-def _triton_backend(device: torch.device, dtype: torch.dtype, wanted: str) -> tuple[Backend | None, str | None]:
-    why_not = triton_unavailable_reason(device)
-    if why_not is None and dtype == torch.float32:
-        from nerfcli.kernels.triton_cuda.backend import TritonBackend
-
-        return TritonBackend(device), None
-    if why_not is None:
-        why_not = f"float32 is supported, not {str(dtype).removeprefix('torch.')}"
-    if wanted == "auto" and torch.cuda.is_available():
-        _warn_of_slow_gpu(why_not)
-    return None, why_not
-
-
 @functools.cache
 def _why_not_triton(index: int) -> str | None:
     try:
@@ -166,7 +135,7 @@ def _why_not_triton(index: int) -> str | None:
 @functools.cache
 def _warn_of_slow_gpu(reason: str) -> None:
     warnings.warn(
-        f"the GPU kernels cannot be used ({reason}); using plain torch, which is many times slower", stacklevel=5
+        f"the GPU kernels cannot be used ({reason}); using plain torch, which is many times slower", stacklevel=3
     )
 
 
