@@ -29,7 +29,6 @@ COMPILED = HashFieldSettings(contraction="l2", log2_rows=8, coarsest=4, finest=1
 MEDIA: dict[str, FieldSettings] = {
     "compiled sizes": COMPILED,
     "pixels of some width": replace(COMPILED, antialias=True),
-    "other sizes": replace(COMPILED, levels=3, width=16),
     "no hash grid": VoxelFieldSettings(contraction="l2", view_degree=1, log2_vertices=9),
 }
 
@@ -525,6 +524,7 @@ def test_what_repeats_bit_for_bit_says_so():
 def test_a_field_takes_another_backend_where_it_goes():
     field = HashField(COMPILED)
     assert field.backend.name == "numba_cpu"
+    assert HashField(replace(COMPILED, levels=3)).backend.name == "reference"  # a size without compiled kernels
     assert field.backend is field.backend
     assert field.double().backend.name == "reference"
     assert field.float().backend.name == "numba_cpu"

@@ -9,6 +9,7 @@ from torch import nn
 
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.kernels import HashGrid
+from nerfcli.kernels.interface import FEATURES, WIDTH
 
 # Outputs of the density network, the log density first; all of them are inputs of the colour network.
 GEOMETRY = 16
@@ -47,6 +48,10 @@ class HashFieldSettings(FieldSettings):
     @property
     def detailed(self) -> bool:
         return self.log2_rows >= DETAILED_LOG2_ROWS
+
+    @property
+    def is_compiled(self) -> bool:
+        return (self.levels * self.features, self.features, self.width) == (WIDTH, FEATURES, WIDTH)
 
     @property
     def size_text(self) -> str:

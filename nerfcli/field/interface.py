@@ -30,6 +30,11 @@ class FieldSettings(abc.ABC):
         return False
 
     @property
+    def is_compiled(self) -> bool:
+        """True if the fast backends have kernels for a field of this size; else it is the reference's."""
+        return True
+
+    @property
     @abc.abstractmethod
     def size_text(self) -> str:
         """Type and size for people, such as "129x129x129 voxels"."""
@@ -62,7 +67,8 @@ class Field(nn.Module, abc.ABC):
         """Backend of this field, chosen on first use and again after a move to another device or dtype."""
         if self._backend is None:
             some = next(self.parameters())
-            self._backend = kernels.backend_for(some.device, some.dtype)
+            plain = kernels.Backend(some.device)
+            self._backend = kernels.backend_for(some.device, some.dtype) if self.settings.is_compiled else plain
         return self._backend
 
     @backend.setter

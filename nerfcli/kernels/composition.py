@@ -156,7 +156,7 @@ class Backend:
         """Return the density (N,) at coordinates (N, 3) of the unit cube, without gradients."""
         if not isinstance(medium, HashGrid):
             return medium.density(coordinates)
-        return self._density_of(self.hash_encode(coordinates, medium.table, medium.resolutions), medium)
+        return self.operations.density(self.hash_encode(coordinates, medium.table, medium.resolutions), medium.layers)
 
     def hash_encode(
         self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, table_grad: Tensor | None = None
@@ -169,7 +169,7 @@ class Backend:
 
     def _visible_in_grid(self, rays: Rays, along: March, grid: HashGrid, cell_depths: Tensor | None) -> Samples:
         """See `reference.visible_samples`."""
-        return reference.visible_samples(rays, along, grid, cell_depths)
+        return self.operations.visible_samples(rays, along, grid, cell_depths)
 
     def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
         """Return the coordinates of samples again, differentiable in their rays."""
@@ -183,13 +183,10 @@ class Backend:
         points, widths, table_grad = samples.coordinates, samples.widths, grid.table_grad
         return encode_into(points, grid.table, grid.resolutions, widths=widths, table_grad=table_grad)
 
-    def _density_of(self, encoded: Tensor, grid: HashGrid) -> Tensor:
-        """Return the densities of encoded features, without gradients."""
-        return reference.density(encoded, grid.layers)
-
     def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
         """Return densities and colours of encoded features, seen along directions (R, 3) of rays `index` (N,)."""
-        return reference.radiance(encoded, spherical_harmonics(directions, grid.view_degree), index, grid.layers)
+        harmonics = spherical_harmonics(directions, grid.view_degree)
+        return self.operations.radiance(encoded, harmonics, index, grid.layers)
 
     def _contracted(self, starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
         """Return `reference.contracted_distance` of the ends of intervals."""

@@ -5,9 +5,9 @@ from nerfcli.kernels.numba_cpu.compile_all import warm_up
 from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
 from nerfcli.kernels.numba_cpu.coordinates import sample_coordinates
 from nerfcli.kernels.numba_cpu.depth import ray_termination
-from nerfcli.kernels.numba_cpu.hash_grid import can_hash_encode, hash_encode
+from nerfcli.kernels.numba_cpu.hash_grid import hash_encode
 from nerfcli.kernels.numba_cpu.marching import keep_largest, occupied_samples
-from nerfcli.kernels.numba_cpu.networks import can_radiance, density, radiance
+from nerfcli.kernels.numba_cpu.networks import density, radiance
 from nerfcli.kernels.numba_cpu.pixels import pixel_rays
 from nerfcli.kernels.numba_cpu.rays import ray_indices
 from nerfcli.kernels.numba_cpu.row_adam import adam_rows

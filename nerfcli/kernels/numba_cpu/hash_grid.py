@@ -335,18 +335,6 @@ class _HashEncode(torch.autograd.Function):
         return of_points, of_table if ctx.table_grad is None else None, None, None, None, None
 
 
-def can_hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> bool:
-    """Return whether this module's `hash_encode` supports these tensors; the reference checks malformed ones."""
-    rows, features = table.shape[1:]
-    return (
-        points.device.type == table.device.type == "cpu"
-        and points.dtype == table.dtype == torch.float32
-        and features == FEATURES
-        and len(resolutions) == len(table)
-        and rows & (rows - 1) == 0
-    )
-
-
 def hash_encode(
     points: Tensor,
     table: Tensor,

@@ -311,16 +311,6 @@ class _Radiance(torch.autograd.Function):
         return encoded_gradient, of_rays, None, *by_layer
 
 
-def can_radiance(encoded: Tensor, weights: tuple[Tensor, ...]) -> bool:
-    """Return whether this module supports these sizes, device and precision."""
-    shapes = [tuple(w.shape) for w in weights]
-    wanted = [(WIDTH, WIDTH), (OUT, WIDTH), (WIDTH, WIDTH), (WIDTH, WIDTH), (3, WIDTH)]
-    return (
-        encoded.device.type == "cpu" and encoded.dtype == torch.float32 and shapes == wanted[: len(shapes)]
-        and encoded.shape[-1] == WIDTH
-    )  # fmt: skip
-
-
 def radiance(encoded: Tensor, harmonics: Tensor, rays: Tensor, weights: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
     """See `reference.radiance`; float32 on the CPU, differentiable in `encoded`, `harmonics` and the weights."""
     return _Radiance.apply(encoded, harmonics, rays, *weights)

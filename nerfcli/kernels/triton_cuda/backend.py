@@ -1,7 +1,7 @@
 """Backend of the GPU kernels: float32 fields, computed in float16 with float32 sums where it is safe.
 
-The reference, on the device, samples and evaluates a hash grid of sizes that the kernels do not support, and computes
-total variation and projections of scans.
+The reference, on the device, looks up tables of 2^31 numbers and more, and computes total variation and projections of
+scans.
 """
 
 import weakref
@@ -10,9 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerfcli.kernels import reference
 from nerfcli.kernels.composition import Backend
-from nerfcli.kernels.interface import FEATURES, AdamStep, HashGrid, March, Rays, Samples
+from nerfcli.kernels.interface import AdamStep, HashGrid, March, Rays, Samples
 from nerfcli.kernels.triton_cuda import compositing, hash_grid, marching, networks, operations, rays
 from nerfcli.kernels.triton_cuda.coordinates import sample_coordinates
 from nerfcli.kernels.triton_cuda.row_adam import adam_rows
@@ -49,27 +48,22 @@ class TritonBackend(Backend):
     def hash_encode(
         self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, table_grad: Tensor | None = None
     ) -> Tensor:
-        if hash_grid.can_hash_encode(table, resolutions):
+        if table.numel() < 2**31:  # indices into the table have 32 bits
             return hash_grid.hash_encode(points, table, resolutions, table_grad)
         return super().hash_encode(points, table, resolutions, table_grad=table_grad)
 
     def adam_rows(self, table: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *, step: AdamStep) -> None:
-        if table.shape[-1] == FEATURES:
-            adam_rows(table, gradient, first, second, half=self._half.of(table), step=step)
-        else:
-            super().adam_rows(table, gradient, first, second, step=step)
+        adam_rows(table, gradient, first, second, half=self._half.of(table), step=step)
 
     @torch.no_grad()
     def density(self, coordinates: Tensor, medium: Any) -> Tensor:
-        if not (isinstance(medium, HashGrid) and _fits(medium)):
+        if not isinstance(medium, HashGrid):
             return super().density(coordinates, medium)
         table = self._half.of(medium.table)
         code = hash_grid.encode(coordinates.contiguous(), table, medium.resolutions, widths=None, dtype=torch.float16)
         return networks.density(code, medium.layers)
 
     def _visible_in_grid(self, rays: Rays, along: March, grid: HashGrid, cell_depths: Tensor | None = None) -> Samples:
-        if not _fits(grid):
-            return reference.visible_samples(rays, along, grid, cell_depths)
         with torch.no_grad():
             table = self._half.of(grid.table)
             return marching.visible_samples(
@@ -88,8 +82,6 @@ class TritonBackend(Backend):
         )
 
     def _radiance(self, samples: Samples, directions: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
-        if not _fits(grid):
-            return super()._radiance(samples, directions, grid)
         assert samples.encoded is not None
         return _Radiance.apply(
             samples.coordinates, directions, grid.table, self._half.of(grid.table), grid.table_grad, samples.encoded,
@@ -108,8 +100,6 @@ class TritonBackend(Backend):
         return rays.sum_along_rays(values[:, None], offsets)[:, 0]
 
     def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
-        if not _fits(grid):
-            return super()._networks(encoded, directions, index, grid)
         return networks.radiance(encoded.half(), directions.contiguous(), index, grid.layers, degree=grid.view_degree)
 
 
@@ -149,11 +139,3 @@ class _Radiance(torch.autograd.Function):
         of_directions = rays.sum_along_rays(by_direction, offsets) if rays_learn else None
         of_table = of_table if ctx.table_grad is None else None
         return of_points, of_directions, of_table, *(None,) * 8, *of_layers
-
-
-def _fits(grid: HashGrid) -> bool:
-    """Return whether the kernels support the sizes of a grid."""
-    levels, _, features = grid.table.shape
-    return hash_grid.can_hash_encode(grid.table, grid.resolutions) and networks.can_radiance(
-        levels * features, grid.layers
-    )

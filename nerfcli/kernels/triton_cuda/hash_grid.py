@@ -149,13 +149,6 @@ def _points_backward(
         tl.store(out + i * 3 + axis, tl.where((at < 0.0) | (at > 1.0), 0.0, slope), mask=valid)
 
 
-def can_hash_encode(table: Tensor, resolutions: tuple[int, ...]) -> bool:
-    """Return whether this module supports a table; malformed ones go to the reference's checks."""
-    levels, rows, features = table.shape
-    fits = table.numel() < 2**31  # indices into the table have 32 bits
-    return features == FEATURES and len(resolutions) == levels and rows & (rows - 1) == 0 and fits
-
-
 def encode(
     points: Tensor,
     table: Tensor,

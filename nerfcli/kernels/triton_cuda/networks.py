@@ -12,7 +12,7 @@ import triton.language as tl
 from torch import Tensor
 
 from nerfcli.kernels.activations import LOG_DENSITY_LIMIT
-from nerfcli.kernels.interface import OUT, WIDTH
+from nerfcli.kernels.interface import WIDTH
 from nerfcli.kernels.triton_cuda.launch import Size, blocks, jit, launch
 
 
@@ -238,17 +238,6 @@ def _backward(
     tl.atomic_add(by_c1 + 16 + wide[None, :] * 32 + out[:, None], d_seen * unscale, sem="relaxed")
     tl.atomic_add(by_c2 + wide[None, :] * H + wide[:, None], d_fourth * unscale, sem="relaxed")
     tl.atomic_add(by_c3 + out[None, :] * H + wide[:, None], d_fifth * unscale, mask=(out < 3)[None, :], sem="relaxed")
-
-
-def can_radiance(code_width: int, layers: tuple[Tensor, ...]) -> bool:
-    """Return whether this module supports these layers behind codes of this width; if not, the reference is used."""
-    hidden = len(layers[0])
-    shapes = ((hidden, WIDTH), (OUT, hidden), (hidden, 2 * OUT), (hidden, hidden), (3, hidden))
-    return (
-        code_width == WIDTH
-        and hidden in (32, 64)
-        and all(tuple(layer.shape) == shape for layer, shape in zip(layers, shapes, strict=False))
-    )
 
 
 def density(encoded: Tensor, layers: tuple[Tensor, ...], *, count: Tensor | None = None) -> Tensor:
