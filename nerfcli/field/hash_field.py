@@ -108,13 +108,8 @@ class HashField(Field):
         self.weights[2][:, GEOMETRY + (degree + 1) ** 2 :] = 0.0
 
 
-def learning_levels(detail: float, levels: int) -> int:
-    """Return how many of the levels learn, the coarsest first; see `Field.medium`."""
-    first = min(FIRST_LEVELS, levels)
-    return min(levels, max(1, first + math.floor((levels - first) * detail)))
-
-
 def _resolutions_at(detail: float, resolutions: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the resolutions of the levels that learn with a detail, and 0 for the others."""
-    learning = learning_levels(detail, len(resolutions))
+    """Return the resolutions of the levels that learn with a detail, the coarsest first, and 0 for the others."""
+    levels, first = len(resolutions), min(FIRST_LEVELS, len(resolutions))
+    learning = max(1, first + math.floor((levels - first) * detail))
     return tuple(side if level < learning else 0 for level, side in enumerate(resolutions))

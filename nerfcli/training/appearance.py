@@ -121,7 +121,8 @@ class Appearance(nn.Module):
         exposure, photos = self.exposure, self._pool.photo_of(drawn.numbers)
 
         def shown(colours: Tensor) -> Tensor:
-            return _up_to_white(exposure(colours, photos), drawn.colours)
+            found = exposure(colours, photos)
+            return torch.where(drawn.colours[:, :3] < SATURATED, found, found.clamp_max(1.0))
 
         if not self._pool.has_alpha:
             return shown(rendered), measured
@@ -138,8 +139,3 @@ def over_background(colours: Tensor, background: Tensor) -> Tensor:
         return colours
     alpha = colours[:, 3:]
     return alpha * colours[:, :3] + (1.0 - alpha) * background
-
-
-def _up_to_white(rendered: Tensor, colours: Tensor) -> Tensor:
-    """Clip rendered colours (R, 3) to white where those of the photo (R, 3 or 4) are white."""
-    return torch.where(colours[:, :3] < SATURATED, rendered, rendered.clamp_max(1.0))

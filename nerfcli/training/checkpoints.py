@@ -126,10 +126,6 @@ class Checkpoints:
             return given
         return refinement.frames(*given)
 
-    def write_cameras(self) -> None:
-        """Write RUN/cameras.json, with the exposures of held-out photos."""
-        self._write_cameras(self._run)
-
     def keep_waypoint(self) -> None:
         """Keep the current field, cameras and exposures until the training is over, see `measure_waypoints`.
 
@@ -142,9 +138,10 @@ class Checkpoints:
         except OSError as error:
             raise cannot_write(waypoint, error) from error
         save_model(waypoint / FIELD, self.model())
-        self._write_cameras(waypoint)
+        self.write_cameras(waypoint)
 
-    def _write_cameras(self, folder: Path) -> None:
+    def write_cameras(self, folder: Path) -> None:
+        """Write FOLDER/cameras.json, with the exposures of held-out photos."""
         refined = self._fitting.appearance.cameras is not None
         given = {frame.name: frame for frame in self._scene.frames} if refined else None
         write_cameras(folder, *self.frames(), given=given, exposures=self.exposures())
@@ -176,7 +173,7 @@ class Checkpoints:
 
     def _write_field(self, model: Model) -> None:
         save_model(self._run / FIELD, model)
-        self.write_cameras()
+        self.write_cameras(self._run)
 
 
 def read_checkpoint(run: Path, device: str) -> tuple[tuple[dict[str, Tensor], dict[str, Any]], EarlierDecisions]:

@@ -36,12 +36,6 @@ from nerfcli.training.sentinel import FAILURES, Sentinel
 OCCLUDERS = "occluders"
 
 
-def remove_left_out(run: Path) -> None:
-    """Remove the masks of an earlier training from a run folder."""
-    if (run / OCCLUDERS).is_dir():
-        shutil.rmtree(run / OCCLUDERS)
-
-
 def write_left_out(run: Path, inputs: TrainingInputs, *, notify: Callable[[str], None]) -> None:
     """Write RUN/occluders/PHOTO.png, black where pixels are left out, for each photo with such pixels; report how many.
 
@@ -139,7 +133,7 @@ def train(
     chosen = replace(settings, downscale=inputs.factor, contraction=inputs.extent.contraction)
     write_config(run, replace(RunConfig.describing(scene), settings=chosen, selection=inputs.selection))
     checkpoints = Checkpoints(run, fitting, totals, inputs=inputs, scene=scene)
-    checkpoints.write_cameras()
+    checkpoints.write_cameras(run)
     sentinel = Sentinel(fitting, run=run, notify=notify)
     distributed.gathered(None)  # wait until all processes have loaded their photos
     with deferred_interrupts() as interrupts:
@@ -174,7 +168,8 @@ def _clear(run: Path) -> None:
         run.mkdir(parents=True, exist_ok=True)
         for old in (*(run / name for name in (STATE, FIELD, LOG, METRICS)), *run.glob(FAILURES)):
             old.unlink(missing_ok=True)
-        remove_left_out(run)
+        if (run / OCCLUDERS).is_dir():
+            shutil.rmtree(run / OCCLUDERS)
     except OSError as error:
         raise cannot_write(run, error) from error
     forget_waypoints(run)

@@ -30,9 +30,10 @@ class Adam:
 
     def __init__(self, parameters: Iterable[Tensor]):
         self._parameters = list(parameters)
+        # On a GPU, the one kernel that steps all parameters reads the number of steps; else the host does.
         self._state = [
             {
-                "step": torch.zeros((), device=_place_of_count(parameter)),
+                "step": torch.zeros((), device=parameter.device if parameter.is_cuda else "cpu"),
                 "exp_avg": torch.zeros_like(parameter, requires_grad=False),
                 "exp_avg_sq": torch.zeros_like(parameter, requires_grad=False),
             }
@@ -82,11 +83,6 @@ class Adam:
             for name, value in entry.items():
                 stored = tensors.get(f"{prefix}.{index}.{name}")
                 entry[name] = torch.zeros_like(value) if stored is None else stored.to(value.device)
-
-
-def _place_of_count(parameter: Tensor) -> torch.device:
-    """Return where the number of steps is read: on a GPU by the one kernel that steps all parameters."""
-    return parameter.device if parameter.is_cuda else torch.device("cpu")
 
 
 class FieldOptimiser:

@@ -184,7 +184,10 @@ class Schedule:
             furthest: the largest progress of any budget so far: a training that is resumed with a larger budget begins
                 at a smaller one, and keeps its detail and its closed cells.
         """
+        components = self.settings.components
         closed = min(1.0, max(step / self.closing_steps, furthest / CLOSING_ENDS))
+        # Photos do not improve on the distances of a sensor: these keep their weight.
+        of_points = 1.0 if components.sensor else point_weight(progress, step, self.parallax)
         return StepPlan(
             step=step,
             samples=self.settings.samples_at(step),
@@ -192,14 +195,10 @@ class Schedule:
             detail=self.detail(furthest, step),
             stride=stride(progress, step),
             threshold=FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed,
-            weights=loss_weights(self.settings.components, self.point_weight(progress, step)),
+            weights=loss_weights(components, of_points),
             are_emerging=progress < EMERGING_ENDS,
             cameras=camera_plan(max(0.0, progress - self.cameras_from) / (1.0 - self.cameras_from)),
         )
-
-    def point_weight(self, progress: float, step: int) -> float:
-        """Return the weight of known distances: constant with those of a sensor, which photos do not improve on."""
-        return 1.0 if self.settings.components.sensor else point_weight(progress, step, self.parallax)
 
     def learning_rate(self, progress: float, step: int) -> float:
         """Return the learning rate: linear warm-up, then half a cosine from the first to the final rate."""

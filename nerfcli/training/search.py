@@ -83,8 +83,9 @@ def judge(base: Sequence[Trial], candidate: Candidate, tried: Sequence[Trial], *
     halves = [_gains(one, other, halfway=True).mean() for one, other in zip(base, tried, strict=True)]
     trend = gain - float(np.mean(halves))
     cost = sum(trial.seconds for trial in tried) / sum(trial.seconds for trial in base) - 1.0
-    # Gain of the unchanged model from twice as many steps.
-    slope_db = max(0.0, float(np.mean([_gains_by_steps(trial).mean() for trial in base])))
+    # Gain of the unchanged model from twice as many steps: from the second half of its own.
+    halves_of_base = [_gains(replace(trial, errors=trial.halfway), trial).mean() for trial in base]
+    slope_db = max(0.0, float(np.mean(halves_of_base)))
     at_equal_time = gain - slope_db * math.log2(1.0 + cost) if by_time else gain
     least = rule.least_db + (rule.errors if seeds > 1 else rule.errors_of_one) * error
     in_the_end = gain + min(0.0, trend) if rule is REMOVAL else gain
@@ -108,11 +109,6 @@ def _gains(base: Trial, changed: Trial, *, halfway: bool = False) -> np.ndarray:
     errors = [(trial.halfway if halfway else trial.errors)[judged] / base.counts[judged] for trial in (base, changed)]
     floor = FLOOR * errors[0].mean() + 1e-12
     return 10.0 * np.log10((errors[0] + floor) / (errors[1] + floor))
-
-
-def _gains_by_steps(trial: Trial) -> np.ndarray:
-    """Return the gain from the second half of a trial's steps, (judged photos,) in dB."""
-    return _gains(replace(trial, errors=trial.halfway), trial)
 
 
 class Search:

@@ -138,7 +138,7 @@ def sensor_depths(known: PointDepths, pool: PixelPool, *, notify: Callable[[str]
         f"depths of the sensor: {total - off:,} pixels, {fit.scale:.4g} scene units per metre, {_agreement(fit)}",
         *(
             [f"its view differs from the photos': it is {1 / fit.registration.zoom:.2f} times as wide"]
-            if _is_moved(fit)
+            if fit.registration != Registration()
             else []
         ),
         f"left out where points disagree: {100 * off / max(1, total):.1f} % of the pixels"
@@ -151,10 +151,6 @@ def sensor_depths(known: PointDepths, pool: PixelPool, *, notify: Callable[[str]
 
 def _agreement(fit: Fit) -> str:
     return f"{100 * fit.agreeing:.0f} % of {fit.compared:,} points that photos see agree within {100 * AGREES:.0f} %"
-
-
-def _is_moved(fit: Fit) -> bool:
-    return fit.registration != Registration()
 
 
 def _unread(unreadable: dict[str, str]) -> list[str]:
