@@ -160,8 +160,12 @@ def rays_and_steps(reach: float, samples: int, generator: torch.Generator) -> In
 
 
 def sample_coordinates(contraction: str, module: ModuleType, given: Inputs) -> Inputs:
-    spans = (given[name] for name in ("origins", "directions", "starts", "ends"))
-    return {"coordinates": module.sample_coordinates(*spans, offsets=given["offsets"], contraction=contraction)}
+    """Compute coordinates; fast kernels have only their gradient, for those that marching has computed."""
+    spans = [given[name] for name in ("origins", "directions", "starts", "ends")]
+    named = {"offsets": given["offsets"], "contraction": contraction}
+    if module is not reference:
+        named["computed"] = reference.sample_coordinates(*(x.detach() for x in spans), **named)
+    return {"coordinates": module.sample_coordinates(*spans, **named)}
 
 
 def rows_and_moments(magnitude: float, rows: int, generator: torch.Generator) -> Inputs:

@@ -63,7 +63,6 @@ def run_training() -> None:
     """Run the kernels of a training step, and those of depth."""
     direction, offsets, starts, lengths = _two_samples()
     spans = (starts, starts + 1)
-    sample_coordinates(direction, direction, *spans, offsets=offsets, contraction="l2", computed=None)
     ray = direction.clone().requires_grad_()
     points = sample_coordinates(ray, ray, *spans, offsets=offsets, contraction="l2", computed=torch.zeros(2, 3))
     table, weights = _field()

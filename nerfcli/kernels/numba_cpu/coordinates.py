@@ -1,6 +1,6 @@
 """Gradients of the coordinates of samples with respect to their rays, on CPU threads; a thread owns rays.
 
-Same operation as `reference.sample_coordinates`, in float32.
+Same operation as `reference.sample_coordinates`, in float32, for coordinates that marching has already computed.
 """
 
 from typing import Any
@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels.contraction import CONTRACTIONS
-from nerfcli.kernels.numba_cpu.rays import cube
 from nerfcli.kernels.numba_cpu.threads import use_threads
 
 
@@ -38,22 +37,6 @@ def _back_from_cube(x: Any, y: Any, z: Any, contraction: Any, a: Any, b: Any, c:
         (scale * b + along * v) * quarter,
         (scale * c + along * w) * quarter,
     )
-
-
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _coordinates(
-    origins: Any, directions: Any, starts: Any, ends: Any, offsets: Any, contraction: Any, out: Any
-) -> None:
-    for ray in numba.prange(origins.shape[0]):
-        for i in range(offsets[ray], offsets[ray + 1]):
-            t = (starts[i] + ends[i]) * np.float32(0.5)
-            x, y, z = cube(
-                origins[ray, 0] + directions[ray, 0] * t,
-                origins[ray, 1] + directions[ray, 1] * t,
-                origins[ray, 2] + directions[ray, 2] * t,
-                contraction,
-            )
-            out[i, 0], out[i, 1], out[i, 2] = x, y, z
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
@@ -85,18 +68,11 @@ class _SampleCoordinates(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor,
-        contraction: int, computed: Tensor | None,
+        contraction: int, computed: Tensor,
     ) -> Tensor:  # fmt: skip
-        rays = [t.detach().contiguous() for t in (origins, directions, starts, ends, offsets)]
-        ctx.save_for_backward(*rays)
+        ctx.save_for_backward(*(t.detach().contiguous() for t in (origins, directions, starts, ends, offsets)))
         ctx.contraction = contraction
-        if computed is not None:
-            return computed.view_as(computed)
-        use_threads()
-        out = torch.empty(len(starts), 3)
-        o, d, s, e, at = (t.numpy() for t in rays)
-        _coordinates(o, d, s, e, at, contraction, out.numpy())
-        return out
+        return computed.view_as(computed)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
@@ -116,12 +92,12 @@ def sample_coordinates(
     *,
     offsets: Tensor,
     contraction: str,
-    computed: Tensor | None = None,
+    computed: Tensor,
 ) -> Tensor:
     """See `reference.sample_coordinates`; float32 on the CPU, differentiable in origins and directions.
 
     Args:
-        computed: (N, 3), the result, if it has already been computed without gradients.
+        computed: (N, 3), the result, already computed without gradients.
     """
     number = CONTRACTIONS.index(contraction)
     return _SampleCoordinates.apply(origins, directions, starts, ends, offsets, number, computed)
