@@ -395,25 +395,20 @@ def test_rays_that_meet_nothing_see_the_background(wanted):
 
 
 def test_what_marching_has_computed_is_not_computed_again(monkeypatch):
-    """The step with gradients reuses the coordinates and codes of samples from marching."""
+    """The step with gradients reuses the codes of samples from marching."""
     field = field_of("compiled sizes", torch.float32, "numba_cpu")
     rays, march = rays_and_march(5, torch.float32)
     rays = rays._replace(origins=rays.origins.requires_grad_())
     handed: list[bool] = []
-    encode, place = numba_cpu.hash_encode, numba_cpu.sample_coordinates
+    encode = numba_cpu.hash_encode
 
     def encoding(points: Tensor, table: Tensor, *rest: Any) -> Tensor:
         handed.append(rest[2] is not None)
         return encode(points, table, *rest)
 
-    def placing(*given: Tensor, **named: Any) -> Tensor:
-        handed.append(named["computed"] is not None)
-        return place(*given, **named)
-
     monkeypatch.setattr(numba_cpu, "hash_encode", encoding)
-    monkeypatch.setattr(numba_cpu, "sample_coordinates", placing)
     field.backend.render_rays(rays, march, field.medium(), background=torch.zeros(5, 3))
-    assert handed == [True, True]
+    assert handed == [True]
 
 
 @pytest.fixture

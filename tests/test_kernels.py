@@ -156,16 +156,14 @@ def rays_and_steps(reach: float, samples: int, generator: torch.Generator) -> In
         "starts": starts,
         "ends": starts + 0.1 * reach,
         "offsets": offsets,
+        "gradient": torch.randn(samples, 3, generator=generator),
     }
 
 
-def sample_coordinates(contraction: str, module: ModuleType, given: Inputs) -> Inputs:
-    """Compute coordinates; fast kernels have only their gradient, for those that marching has computed."""
-    spans = [given[name] for name in ("origins", "directions", "starts", "ends")]
-    named = {"offsets": given["offsets"], "contraction": contraction}
-    if module is not reference:
-        named["computed"] = reference.sample_coordinates(*(x.detach() for x in spans), **named)
-    return {"coordinates": module.sample_coordinates(*spans, **named)}
+def ray_gradients(contraction: str, module: ModuleType, given: Inputs) -> Inputs:
+    lines = (given[name] for name in ("origins", "directions", "starts", "ends"))
+    named = {"offsets": given["offsets"], "contraction": contraction, "gradient": given["gradient"]}
+    return dict(zip(("by origins", "by directions"), module.ray_gradients(*lines, **named), strict=True))
 
 
 def rows_and_moments(magnitude: float, rows: int, generator: torch.Generator) -> Inputs:
@@ -263,10 +261,9 @@ def cases() -> Iterator[Case]:
             relative=5 * RELATIVE, on_gpu=False,
         )  # fmt: skip
     for contraction in kernels.CONTRACTIONS:
-        for reach in (1e-3, 2.0, 1e6):
-            name = f"sample_coordinates, {contraction}, to {reach:g}"
-            run = partial(sample_coordinates, contraction)
-            yield Case(name, partial(rays_and_steps, reach), run, ("origins", "directions"), on_gpu=False)
+        for reach in (1e-3, 2.0, 1e6, 1e12):
+            name, run = f"ray_gradients, {contraction}, to {reach:g}", partial(ray_gradients, contraction)
+            yield Case(name, partial(rays_and_steps, reach), run, relative=2e-5)
         name, run = f"occupied_samples, {contraction}", partial(occupied_samples, contraction)
         yield Case(name, rays_through_cells, run, sizes=(0, 1, 5, 123))
     for magnitude, decay in ((1e-12, 0.0), (1.0, 0.0), (1.0, 0.1), (1e6, 1e5)):

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_kernels import DEVICE, RELATIVE, SIZES, assert_close, offsets_of, points_and_table
+from test_kernels import DEVICE, RELATIVE, SIZES, assert_close, points_and_table
 from torch import Tensor
 from triton.language import core
 from triton.language.semantic import TritonSemantic
@@ -39,7 +39,7 @@ from nerfcli.kernels import (
 from nerfcli.kernels.contraction import contract
 from nerfcli.kernels.selftest.measure import MET, Precision
 from nerfcli.kernels.selftest.table import OF_GPU, checks, row_of
-from nerfcli.kernels.triton_cuda import compositing, coordinates, hash_grid, launch, marching, networks
+from nerfcli.kernels.triton_cuda import compositing, hash_grid, launch, marching, networks
 from nerfcli.kernels.triton_cuda.backend import TritonBackend
 from nerfcli.kernels.triton_cuda.launch import seen
 from nerfcli.kernels.triton_cuda.warm_up import warm_up
@@ -255,31 +255,6 @@ def test_faint_samples_are_left_out_but_counted_for_visits_and_never_all(least, 
     assert_close(fast.density, exact.density, "density", relative=HALF)
     assert_close(cell_depths, expected_visits, "visits", relative=HALF)
     assert least != 0.08 or ((cell_depths > 0) & (cell_depths < least)).any()  # cells in which all samples are left out
-
-
-@pytest.mark.parametrize("samples", SIZES)
-@pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
-@pytest.mark.parametrize("reach", [1e-3, 2.0, 1e12])
-def test_sample_coordinates(samples, contraction, reach, generator):
-    offsets = offsets_of(samples, generator)
-    rays = len(offsets) - 1
-    origins, directions = torch.randn(2, rays, 3, generator=generator)
-    starts = torch.rand(samples, generator=generator) * reach
-    ends = starts + 0.1 * reach
-    gradient = torch.randn(samples, 3, generator=generator)
-    exact = [x.double().requires_grad_() for x in (origins, directions)]
-    computed = reference.sample_coordinates(
-        *exact, starts.double(), ends.double(), offsets=offsets, contraction=contraction
-    )
-    computed.backward(gradient.double())
-    fast = [x.to(DEVICE).requires_grad_() for x in (origins, directions)]
-    found = coordinates.sample_coordinates(
-        *fast, *on_device(starts, ends), offsets=offsets.to(DEVICE), contraction=contraction,
-        computed=computed.detach().float().to(DEVICE),
-    )  # fmt: skip
-    found.backward(gradient.to(DEVICE))
-    for name, a, b in zip(("origins", "directions"), fast, exact, strict=True):
-        assert_close(a.grad, b.grad, name, relative=2e-5)
 
 
 def test_visits_leave_out_densities_that_are_not_a_number(generator):

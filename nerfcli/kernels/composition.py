@@ -7,7 +7,7 @@ On a GPU, `render_rays` of a hash grid makes the host wait once, for the number 
 
 import math
 from types import ModuleType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -80,7 +80,9 @@ class Backend:
         samples = self._visible(rays.detached(), march, medium, cell_depths)
         starts, ends, offsets, index = samples.starts, samples.ends, samples.offsets, samples.rays
         if torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad):
-            samples = samples._replace(coordinates=self._coordinates(rays, samples, march.contraction))
+            lines = rays.origins, rays.directions
+            coordinates = _Coordinates.apply(*lines, samples, march.contraction, self.operations)
+            samples = samples._replace(coordinates=coordinates)
         if isinstance(medium, HashGrid):
             if medium.antialias and rays.cones is not None:
                 widths = sample_widths(rays.detached(), starts, ends, index=index, contraction=march.contraction)
@@ -171,13 +173,6 @@ class Backend:
         """See `reference.visible_samples`."""
         return self.operations.visible_samples(rays, along, grid, cell_depths)
 
-    def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
-        """Return the coordinates of samples again, differentiable in their rays."""
-        spans = samples.starts, samples.ends
-        return reference.sample_coordinates(
-            rays.origins, rays.directions, *spans, offsets=samples.offsets, contraction=contraction
-        )
-
     def _encoded(self, samples: Samples, grid: HashGrid) -> Tensor:
         """Return the encoded features of samples again, with gradients."""
         points, widths, table_grad = samples.coordinates, samples.widths, grid.table_grad
@@ -220,6 +215,26 @@ class Backend:
             return Samples(
                 starts[reached], ends[reached], density[reached], None, coordinates[reached], kept, rays_of_samples
             )
+
+
+class _Coordinates(torch.autograd.Function):
+    """The coordinates of samples, which marching has computed, as a function of their rays."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, origins: Tensor, directions: Tensor, samples: Samples, contraction: str, operations: ModuleType
+    ) -> Tensor:
+        ctx.save_for_backward(origins, directions, samples.starts, samples.ends, samples.offsets)
+        ctx.operations, ctx.contraction = operations, contraction
+        return samples.coordinates.view_as(samples.coordinates)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        *lines, offsets = ctx.saved_tensors
+        by_rays = ctx.operations.ray_gradients(
+            *lines, offsets=offsets, contraction=ctx.contraction, gradient=gradients[0]
+        )
+        return *by_rays, None, None, None
 
 
 def encode_into(

@@ -3,7 +3,7 @@
 from nerfcli.kernels.numba_cpu import machine_code
 from nerfcli.kernels.numba_cpu.compile_all import warm_up
 from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
-from nerfcli.kernels.numba_cpu.coordinates import sample_coordinates
+from nerfcli.kernels.numba_cpu.coordinates import ray_gradients
 from nerfcli.kernels.numba_cpu.depth import ray_termination
 from nerfcli.kernels.numba_cpu.hash_grid import hash_encode
 from nerfcli.kernels.numba_cpu.marching import keep_largest, occupied_samples

@@ -52,17 +52,6 @@ class NumbaBackend(Backend):
     ) -> Tensor:
         return numba_cpu.hash_encode(points, table, resolutions, table_grad)
 
-    def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
-        return numba_cpu.sample_coordinates(
-            rays.origins,
-            rays.directions,
-            samples.starts,
-            samples.ends,
-            offsets=samples.offsets,
-            contraction=contraction,
-            computed=samples.coordinates,
-        )
-
     def _encoded(self, samples: Samples, grid: HashGrid) -> Tensor:
         return numba_cpu.hash_encode(
             samples.coordinates, grid.table, grid.resolutions, grid.table_grad, samples.encoded, samples.widths

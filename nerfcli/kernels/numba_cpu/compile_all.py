@@ -13,7 +13,7 @@ from nerfcli.errors import UserError
 from nerfcli.kernels.interface import AdamStep, HashGrid, March, PixelTable, Rays
 from nerfcli.kernels.numba_cpu import machine_code
 from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
-from nerfcli.kernels.numba_cpu.coordinates import sample_coordinates
+from nerfcli.kernels.numba_cpu.coordinates import ray_gradients
 from nerfcli.kernels.numba_cpu.depth import ray_termination
 from nerfcli.kernels.numba_cpu.hash_grid import hash_encode
 from nerfcli.kernels.numba_cpu.marching import keep_largest, occupied_samples
@@ -63,8 +63,8 @@ def run_training() -> None:
     """Run the kernels of a training step, and those of depth."""
     direction, offsets, starts, lengths = _two_samples()
     spans = (starts, starts + 1)
-    ray = direction.clone().requires_grad_()
-    points = sample_coordinates(ray, ray, *spans, offsets=offsets, contraction="l2", computed=torch.zeros(2, 3))
+    points = torch.zeros(2, 3, requires_grad=True)
+    ray_gradients(direction, direction, *spans, offsets=offsets, contraction="l2", gradient=torch.zeros(2, 3))
     table, weights = _field()
     encoded = hash_encode(points, table, (2,) * 8, None, torch.zeros(2, 32))
     hash_encode(points.detach(), table, (2,) * 8, None, None)

@@ -1,7 +1,4 @@
-"""Gradients of the coordinates of samples with respect to their rays, on CPU threads; a thread owns rays.
-
-Same operation as `reference.sample_coordinates`, in float32, for coordinates that marching has already computed.
-"""
+"""Gradients of the coordinates of samples with respect to their rays, on CPU threads; a thread owns rays."""
 
 from typing import Any
 
@@ -64,27 +61,7 @@ def _backward(
             by_direction[ray, 2] += c * t
 
 
-class _SampleCoordinates(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor,
-        contraction: int, computed: Tensor,
-    ) -> Tensor:  # fmt: skip
-        ctx.save_for_backward(*(t.detach().contiguous() for t in (origins, directions, starts, ends, offsets)))
-        ctx.contraction = contraction
-        return computed.view_as(computed)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        use_threads()
-        o, d, s, e, at = (t.numpy() for t in ctx.saved_tensors)
-        by_origin, by_direction = (torch.zeros(len(o), 3) for _ in range(2))
-        gradient = gradients[0].contiguous().numpy()
-        _backward(o, d, s, e, at, ctx.contraction, gradient, by_origin.numpy(), by_direction.numpy())
-        return by_origin, by_direction, None, None, None, None, None
-
-
-def sample_coordinates(
+def ray_gradients(
     origins: Tensor,
     directions: Tensor,
     starts: Tensor,
@@ -92,12 +69,12 @@ def sample_coordinates(
     *,
     offsets: Tensor,
     contraction: str,
-    computed: Tensor,
-) -> Tensor:
-    """See `reference.sample_coordinates`; float32 on the CPU, differentiable in origins and directions.
-
-    Args:
-        computed: (N, 3), the result, already computed without gradients.
-    """
+    gradient: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return the gradients (R, 3) by origins and directions, from those (N, 3) by `reference.sample_coordinates`."""
+    use_threads()
+    o, d, s, e, at = (x.detach().contiguous().numpy() for x in (origins, directions, starts, ends, offsets))
+    by_origin, by_direction = (torch.zeros(len(origins), 3) for _ in range(2))
     number = CONTRACTIONS.index(contraction)
-    return _SampleCoordinates.apply(origins, directions, starts, ends, offsets, number, computed)
+    _backward(o, d, s, e, at, number, gradient.contiguous().numpy(), by_origin.numpy(), by_direction.numpy())
+    return by_origin, by_direction

@@ -22,6 +22,7 @@ from nerfcli.kernels.reference.marching import (
     keep_largest,
     march,
     occupied_samples,
+    ray_gradients,
     sample_coordinates,
     visible_samples,
 )

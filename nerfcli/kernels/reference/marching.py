@@ -46,6 +46,24 @@ def sample_coordinates(
     return grid_coordinates(points, contraction)
 
 
+def ray_gradients(
+    origins: Tensor,
+    directions: Tensor,
+    starts: Tensor,
+    ends: Tensor,
+    *,
+    offsets: Tensor,
+    contraction: str,
+    gradient: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return the gradients (R, 3) by origins and directions, from those (N, 3) by `sample_coordinates`."""
+    origins, directions = (x.detach().requires_grad_() for x in (origins, directions))
+    with torch.enable_grad():
+        found = sample_coordinates(origins, directions, starts, ends, offsets=offsets, contraction=contraction)
+    by_origin, by_direction = torch.autograd.grad(found, (origins, directions), gradient)
+    return by_origin, by_direction
+
+
 def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the samples of `march` with their coordinates.
 

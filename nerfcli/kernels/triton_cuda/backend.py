@@ -13,7 +13,6 @@ from torch import Tensor
 from nerfcli.kernels.composition import Backend
 from nerfcli.kernels.interface import AdamStep, HashGrid, March, Rays, Samples
 from nerfcli.kernels.triton_cuda import compositing, hash_grid, marching, networks, operations, rays
-from nerfcli.kernels.triton_cuda.coordinates import sample_coordinates
 from nerfcli.kernels.triton_cuda.row_adam import adam_rows
 
 
@@ -69,17 +68,6 @@ class TritonBackend(Backend):
             return marching.visible_samples(
                 rays, along, grid, table=table, capacity=self._capacity, cell_depths=cell_depths
             )
-
-    def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
-        return sample_coordinates(
-            rays.origins,
-            rays.directions,
-            samples.starts,
-            samples.ends,
-            offsets=samples.offsets,
-            contraction=contraction,
-            computed=samples.coordinates,
-        )
 
     def _radiance(self, samples: Samples, directions: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
         assert samples.encoded is not None

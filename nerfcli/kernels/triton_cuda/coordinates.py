@@ -1,9 +1,4 @@
-"""Gradients of the coordinates of samples with respect to their rays, from which cameras learn.
-
-Same operation as `reference.sample_coordinates`, for coordinates that marching has already computed.
-"""
-
-from typing import Any
+"""Gradients of the coordinates of samples with respect to their rays, from which cameras learn."""
 
 import torch
 import triton.language as tl
@@ -75,28 +70,7 @@ def _backward(
     tl.store(by_direction + ray * 3 + 2, bz, mask=there)
 
 
-class _SampleCoordinates(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor, contraction: int,
-        computed: Tensor,
-    ) -> Tensor:  # fmt: skip
-        ctx.save_for_backward(*(t.detach().contiguous() for t in (origins, directions, starts, ends, offsets)))
-        ctx.contraction = contraction
-        return computed.view_as(computed)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        origins = ctx.saved_tensors[0]
-        by_origin, by_direction = torch.empty_like(origins), torch.empty_like(origins)
-        launch(
-            _backward, blocks_of(len(origins)), *ctx.saved_tensors, gradients[0].contiguous(), by_origin, by_direction,
-            len(origins), CONTRACTION=ctx.contraction, RAYS=RAYS, STEPS=STEPS,
-        )  # fmt: skip
-        return by_origin, by_direction, None, None, None, None, None
-
-
-def sample_coordinates(
+def ray_gradients(
     origins: Tensor,
     directions: Tensor,
     starts: Tensor,
@@ -104,12 +78,13 @@ def sample_coordinates(
     *,
     offsets: Tensor,
     contraction: str,
-    computed: Tensor,
-) -> Tensor:
-    """See `reference.sample_coordinates`; float32, differentiable in origins and directions.
-
-    Args:
-        computed: (N, 3), the result, already computed without gradients.
-    """
-    number = CONTRACTIONS.index(contraction)
-    return _SampleCoordinates.apply(origins, directions, starts, ends, offsets, number, computed)
+    gradient: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return the gradients (R, 3) by origins and directions, from those (N, 3) by `reference.sample_coordinates`."""
+    given = [x.detach().contiguous() for x in (origins, directions, starts, ends, offsets, gradient)]
+    by_origin, by_direction, count = torch.empty_like(given[0]), torch.empty_like(given[0]), len(origins)
+    launch(
+        _backward, blocks_of(count), *given, by_origin, by_direction, count,
+        CONTRACTION=CONTRACTIONS.index(contraction), RAYS=RAYS, STEPS=STEPS,
+    )  # fmt: skip
+    return by_origin, by_direction

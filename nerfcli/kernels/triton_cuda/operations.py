@@ -6,6 +6,7 @@ from nerfcli.kernels.interface import AdamStep, HashGrid, March, Rays, Samples
 from nerfcli.kernels.reference import keep_largest
 from nerfcli.kernels.triton_cuda import marching, row_adam
 from nerfcli.kernels.triton_cuda.compositing import composite, distortion, interval_weights, optical_depth_before
+from nerfcli.kernels.triton_cuda.coordinates import ray_gradients
 from nerfcli.kernels.triton_cuda.depth import ray_termination
 from nerfcli.kernels.triton_cuda.hash_grid import hash_encode
 from nerfcli.kernels.triton_cuda.marching import occupied_samples
@@ -22,6 +23,7 @@ __all__ = [
     "occupied_samples",
     "optical_depth_before",
     "pixel_rays",
+    "ray_gradients",
     "ray_indices",
     "ray_termination",
     "visible_samples",
