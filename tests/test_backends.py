@@ -19,7 +19,18 @@ from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.field.kinds import fresh_field
 from nerfcli.field.voxel_field import VoxelFieldSettings
-from nerfcli.kernels import Backend, HashGrid, March, Rays, RaysSeen, RaySums, Targets, numba_cpu, reference
+from nerfcli.kernels import (
+    Backend,
+    HashGrid,
+    March,
+    Rays,
+    RaysSeen,
+    RaySums,
+    Targets,
+    TraceOptions,
+    numba_cpu,
+    reference,
+)
 from nerfcli.kernels.contraction import cube_widths
 from nerfcli.kernels.numba_cpu.backend import NumbaBackend
 
@@ -133,7 +144,7 @@ def test_a_picture_is_what_the_reference_gives_in_float64(name, count):
         rays, march = rays_and_march(count, dtype)
         background = torch.tensor([0.25, 0.5, 1.0], dtype=dtype)
         return field.backend.trace_rays(
-            rays, march, field.medium(), background=background, fractions=(0.25, 0.5), negligible=1e-3
+            rays, march, field.medium(), TraceOptions((0.25, 0.5), 1e-3), background=background
         )
 
     exact = seen("reference", torch.float64)
@@ -162,9 +173,9 @@ def test_compiled_pictures_stay_within_their_bound(negligible):
     background = torch.rand(700, 3, generator=torch.Generator().manual_seed(1))
     seen, whole = (
         field.backend.trace_rays(
-            rays, march._replace(max_optical_depth=depth), field.medium(), background=background, negligible=negligible_
+            rays, march._replace(max_optical_depth=depth), field.medium(), options, background=background
         )
-        for depth, negligible_ in ((2.0, negligible), (1e9, 0.0))
+        for depth, options in ((2.0, TraceOptions(negligible=negligible)), (1e9, TraceOptions()))
     )
     apart = (seen.rgb - whole.rgb).abs().amax(-1)
     assert (apart <= seen.truncation_error * (1 + 1e-4) + 1e-6).all()
@@ -173,8 +184,8 @@ def test_compiled_pictures_stay_within_their_bound(negligible):
     assert (seen.truncation_error <= 0.5 * negligible + seen.ends.transmittance * behind + 1e-6).all()
     some = Rays(*(values[300:310] for values in rays if values is not None))
     alone = field.backend.trace_rays(
-        some, march._replace(max_optical_depth=2.0), field.medium(), background=background[300:310],
-        negligible=negligible,
+        some, march._replace(max_optical_depth=2.0), field.medium(), TraceOptions(negligible=negligible),
+        background=background[300:310],
     )  # fmt: skip
     assert torch.equal(alone.rgb, seen.rgb[300:310])
     assert torch.equal(alone.truncation_error, seen.truncation_error[300:310])
@@ -188,7 +199,8 @@ def test_compiled_pictures_leave_out_no_more_of_a_ray_than_they_may():
         0.05,
     )
     march = march._replace(edges=torch.linspace(0.3, 4.0, 600), max_optical_depth=1e9)
-    seen = field.backend.trace_rays(rays, march, field.medium(), background=torch.zeros(3), negligible=negligible)
+    options = TraceOptions(negligible=negligible)
+    seen = field.backend.trace_rays(rays, march, field.medium(), options, background=torch.zeros(3))
     assert 0.99 * negligible < 2.0 * float(seen.truncation_error.max()) <= negligible * (1 + 1e-6)
 
 
@@ -348,7 +360,8 @@ def test_rays_of_a_picture_are_single_operations_one_after_the_other(name):
     rays, march = rays_and_march(6, torch.float64)
     rays, march, negligible = wide(rays), march._replace(edges=UNEVEN, max_optical_depth=0.4), 0.3
     background = torch.rand(6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    seen = field.backend.trace_rays(rays, march, field.medium(), background=background, negligible=negligible)
+    options = TraceOptions(negligible=negligible)
+    seen = field.backend.trace_rays(rays, march, field.medium(), options, background=background)
     with torch.no_grad():
         kept = samples_by_hand(field, rays, march)
         density, rgb, lengths, _, index = radiance_by_hand(field, rays, kept)

@@ -33,6 +33,7 @@ from nerfcli.kernels import (
     March,
     Rays,
     Targets,
+    TraceOptions,
     reference,
     spherical_harmonics,
 )
@@ -334,17 +335,17 @@ def test_a_picture_is_what_the_reference_gives_in_float64(generator):
     layers = layers_of(32, generator)
     resolutions = tuple(round(4 * 1.22**level) for level in range(8))
     background = torch.tensor([0.25, 0.5, 1.0])
-    named = {"fractions": (0.25, 0.5), "negligible": 0.3}
+    options = TraceOptions((0.25, 0.5), 0.3)
     fast = TritonBackend(DEVICE).trace_rays(
         rays,
         march,
         HashGrid(table.to(DEVICE), resolutions, on_device(*layers)),
+        options,
         background=background.to(DEVICE),
-        **named,
     )
     exact = kernels.backend_for(torch.device("cpu"), torch.float64).trace_rays(
         *exactly(rays, march), HashGrid(table.double(), resolutions, tuple(x.double() for x in layers)),
-        background=background.double(), **named,
+        options, background=background.double(),
     )  # fmt: skip
     assert torch.equal(fast.intervals.offsets.cpu(), exact.intervals.offsets)
     assert_close(fast.rgb, exact.rgb, "rgb", relative=HALF)

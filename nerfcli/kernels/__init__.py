@@ -31,6 +31,7 @@ from nerfcli.kernels.interface import (
     RaySums,
     RayTermination,
     Targets,
+    TraceOptions,
 )
 from nerfcli.kernels.reference import distances_to_occupied, ray_indices, sum_along_rays
 from nerfcli.version import __version__

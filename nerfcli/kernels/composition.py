@@ -28,6 +28,7 @@ from nerfcli.kernels.interface import (
     Samples,
     Targets,
     Trace,
+    TraceOptions,
 )
 
 
@@ -117,25 +118,16 @@ class Backend:
         rays: Rays,
         march: March,
         medium: HashGrid | Medium,
+        options: TraceOptions = TraceOptions(),
         *,
         background: Tensor,
-        fractions: tuple[float, ...] = (),
-        negligible: float = 0.0,
-        keep_intervals: bool = True,
     ) -> RaysSeen:
-        """Render rays for pictures, without gradients.
-
-        Args:
-            background: (R, 3) or (3,) sRGB.
-            fractions: of light for the quantiles to compute, each between 0 and 1.
-            negligible: largest total weight of the samples of a ray whose colours are not evaluated.
-            keep_intervals: whether to return the samples; a backend may return them even if this is False.
-        """
+        """Render rays for pictures, without gradients, on a background (R, 3) or (3,) sRGB."""
         samples = self._visible(rays.detached(), march, medium, None)
         starts, ends, density, offsets = samples.starts, samples.ends, samples.density, samples.offsets
         index, lengths = samples.rays, ends - starts
         weights, _ = self.operations.interval_weights(density, lengths, offsets)
-        unseen = weights <= (negligible / offsets.diff().clamp_min(1).to(weights))[index]
+        unseen = weights <= (options.negligible / offsets.diff().clamp_min(1).to(weights))[index]
         seen = (~unseen).nonzero()[:, 0]
         rgb = torch.full((len(density), 3), UNSEEN, dtype=density.dtype, device=density.device)
         if isinstance(medium, HashGrid):
@@ -146,7 +138,7 @@ class Backend:
         colour, transmittance, _ = self.operations.composite(
             density, rgb, lengths, offsets=offsets, background=background.expand(len(rays.origins), 3)
         )
-        light = self.operations.ray_termination(density, starts, ends, offsets=offsets, fractions=fractions)
+        light = self.operations.ray_termination(density, starts, ends, offsets=offsets, fractions=options.fractions)
         stopped = transmittance <= math.exp(-march.max_optical_depth) * (1 + 1e-5)  # rounding must not hide a stop
         behind = torch.maximum(background, 1.0 - background).amax(-1)  # largest difference from the background's colour
         left_out = UNSEEN * self._sum_along_rays(torch.where(unseen, weights, 0.0), offsets)
@@ -167,7 +159,7 @@ class Backend:
 
         Differentiable in points and in the table, whose gradient is added to `table_grad` if that is given.
         """
-        return encode_into(points, table, resolutions, widths=None, table_grad=table_grad)
+        return _encode_into(points, table, resolutions, widths=None, table_grad=table_grad)
 
     def _visible_in_grid(self, rays: Rays, along: March, grid: HashGrid, cell_depths: Tensor | None) -> Samples:
         """See `reference.visible_samples`."""
@@ -176,7 +168,7 @@ class Backend:
     def _encoded(self, samples: Samples, grid: HashGrid) -> Tensor:
         """Return the encoded features of samples again, with gradients."""
         points, widths, table_grad = samples.coordinates, samples.widths, grid.table_grad
-        return encode_into(points, grid.table, grid.resolutions, widths=widths, table_grad=table_grad)
+        return _encode_into(points, grid.table, grid.resolutions, widths=widths, table_grad=table_grad)
 
     def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
         """Return densities and colours of encoded features, seen along directions (R, 3) of rays `index` (N,)."""
@@ -237,7 +229,7 @@ class _Coordinates(torch.autograd.Function):
         return *by_rays, None, None, None
 
 
-def encode_into(
+def _encode_into(
     points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, widths: Tensor | None, table_grad: Tensor | None
 ) -> Tensor:
     """Return `reference.hash_encode`; the gradient by the table is added to `table_grad` if that is given."""

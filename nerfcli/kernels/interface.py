@@ -128,6 +128,20 @@ class RaySums(NamedTuple):
     samples: Tensor
 
 
+class TraceOptions(NamedTuple):
+    """What rays of pictures give besides their colours, and how exact these are.
+
+    Args:
+        fractions: of light for the quantiles to compute, each between 0 and 1.
+        negligible: largest total weight of the samples of a ray whose colours are not evaluated.
+        keep_intervals: whether to return the samples; a backend may return them even if this is False.
+    """
+
+    fractions: tuple[float, ...] = ()
+    negligible: float = 0.0
+    keep_intervals: bool = True
+
+
 class AdamStep(NamedTuple):
     """A step of Adam on rows, see `adam_rows`.
 

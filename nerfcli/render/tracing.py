@@ -22,7 +22,7 @@ from torch import Tensor
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.kernels import March, Rays, RaysSeen
+from nerfcli.kernels import March, Rays, RaysSeen, TraceOptions
 from nerfcli.kernels.interface import UNSEEN
 from nerfcli.render.trained_field import Marching, TrainedField
 
@@ -127,15 +127,8 @@ def render_rays(
     march = March(edges, model.open_cells, model.contraction, deepest(tolerance), distances=model.distances)
     # All negligible samples of a ray together use at most the rest of the tolerance.
     negligible = (1.0 - STOP_FRACTION) * tolerance / UNSEEN
-    return field.backend.trace_rays(
-        rays,
-        march,
-        field.medium(),
-        background=background,
-        fractions=fractions,
-        negligible=negligible,
-        keep_intervals=keep_intervals,
-    )
+    options = TraceOptions(fractions, negligible, keep_intervals)
+    return field.backend.trace_rays(rays, march, field.medium(), options, background=background)
 
 
 @lru_cache(maxsize=4)

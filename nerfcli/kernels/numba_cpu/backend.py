@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerfcli.kernels import numba_cpu
 from nerfcli.kernels.composition import Backend
-from nerfcli.kernels.interface import HashGrid, March, Medium, Rays, RaysSeen, Samples
+from nerfcli.kernels.interface import HashGrid, March, Medium, Rays, RaysSeen, Samples, TraceOptions
 
 
 class NumbaBackend(Backend):
@@ -27,25 +27,13 @@ class NumbaBackend(Backend):
         rays: Rays,
         march: March,
         medium: HashGrid | Medium,
+        options: TraceOptions = TraceOptions(),
         *,
         background: Tensor,
-        fractions: tuple[float, ...] = (),
-        negligible: float = 0.0,
-        keep_intervals: bool = True,
     ) -> RaysSeen:
         if not isinstance(medium, HashGrid):
-            return super().trace_rays(
-                rays, march, medium, background=background, fractions=fractions, negligible=negligible
-            )
-        return numba_cpu.trace_rays(
-            rays.detached(),
-            march,
-            medium,
-            background=background,
-            fractions=fractions,
-            negligible=negligible,
-            keep_intervals=keep_intervals,
-        )
+            return super().trace_rays(rays, march, medium, options, background=background)
+        return numba_cpu.trace_rays(rays.detached(), march, medium, options, background=background)
 
     def hash_encode(
         self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, table_grad: Tensor | None = None

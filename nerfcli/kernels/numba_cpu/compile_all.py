@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerfcli import child
 from nerfcli.errors import UserError
-from nerfcli.kernels.interface import AdamStep, HashGrid, March, PixelTable, Rays
+from nerfcli.kernels.interface import AdamStep, HashGrid, March, PixelTable, Rays, TraceOptions
 from nerfcli.kernels.numba_cpu import machine_code
 from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
 from nerfcli.kernels.numba_cpu.coordinates import ray_gradients
@@ -86,7 +86,7 @@ def run_rendering() -> None:
     table, weights = _field()
     grid = HashGrid(table, (2,) * 8, weights)
     _, _, _, _, points, *_ = visible_samples(rays, along, grid)
-    trace_rays(rays, along, grid, background=torch.zeros(3), fractions=(0.5,), negligible=0.0)
+    trace_rays(rays, along, grid, TraceOptions((0.5,)), background=torch.zeros(3))
     occupied_samples(rays, along)
     keep_largest(torch.zeros(2, 2, 2), points, lengths[: len(points)])
     pixel = torch.zeros(1, dtype=torch.int64)

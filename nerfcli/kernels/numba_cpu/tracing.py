@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels.harmonics import spherical_harmonics
-from nerfcli.kernels.interface import UNSEEN, HashGrid, Intervals, March, Rays, RaysSeen
+from nerfcli.kernels.interface import UNSEEN, HashGrid, Intervals, March, Rays, RaysSeen, TraceOptions
 from nerfcli.kernels.numba_cpu.depth import add_interval, new_sums, ray_termination_of
 from nerfcli.kernels.numba_cpu.hash_grid import encode_range, new_scratch
 from nerfcli.kernels.numba_cpu.networks import OUT, TILE, WIDTH, colour_range, density_tile
@@ -126,17 +126,9 @@ def _sort(borders: Any, offsets: Any, owner: Any, record: Any, found: Any, spans
             place[ray] += 1
 
 
-def trace_rays(
-    rays: Rays,
-    along: March,
-    grid: HashGrid,
-    *,
-    background: Tensor,
-    fractions: tuple[float, ...],
-    negligible: float,
-    keep_intervals: bool = True,
-) -> RaysSeen:
+def trace_rays(rays: Rays, along: March, grid: HashGrid, options: TraceOptions, *, background: Tensor) -> RaysSeen:
     """See `Backend.trace_rays`; float32 on the CPU."""
+    fractions, negligible, keep_intervals = options
     threads, count, intervals = use_threads(), len(rays.origins), len(along.edges) - 2
     borders = np.arange(threads + 1) * count // threads
     # Room for all samples of all rays: the system allocates memory only when it is first written to.

@@ -4,7 +4,7 @@ from itertools import product
 
 import torch
 
-from nerfcli.kernels.interface import AdamStep, BearingGrids, HashGrid, March, PixelTable, Rays, Targets
+from nerfcli.kernels.interface import AdamStep, BearingGrids, HashGrid, March, PixelTable, Rays, Targets, TraceOptions
 from nerfcli.kernels.triton_cuda.backend import TritonBackend
 
 
@@ -43,7 +43,7 @@ def warm_up(device: torch.device) -> None:
                 cell_depths=cells,
             )
             (sums.rgb.sum() + sums.distortion.sum()).backward()
-        backend.trace_rays(rays.detached(), march, grid, background=torch.zeros(3, device=device), fractions=(0.5,))
+        backend.trace_rays(rays.detached(), march, grid, TraceOptions((0.5,)), background=torch.zeros(3, device=device))
     backend.density(torch.full((2, 3), 0.5, device=device), grid)
     backend.adam_rows(table, table_grad, mean, square, step=AdamStep(1, 0.0, (0.9, 0.99), 1e-15))
     if device.type == "cuda":
