@@ -127,11 +127,3 @@ def test_the_fullest_cells_of_thin_fog_stay_open(grid):
     assert torch.equal(grid.above(1e-3), depth > 1e-3)
     depth[0, 0, 0] = math.nan
     assert torch.equal(grid.above(1e9), ~(depth <= depth[depth.isfinite()].double().mean()))
-
-
-def test_state_round_trip(grid):
-    refreshed(grid, Ramp())
-    other = Occupancy(SIDE, torch.device("cpu"))
-    other.restore(grid.state())
-    assert torch.equal(other.above(20.0), grid.above(20.0))
-    assert not other.above(20.0).all()

@@ -86,7 +86,7 @@ def test_a_start_takes_longer_for_the_fewest_steps_but_twice_as_long_at_most(tri
     """A clock on which every step takes a second."""
     gone = clock(monkeypatch, itertools.repeat(1.0))
     for fewest, steps in ((0, 10), (7, 10), (14, 14)):
-        assert trials.begin(Components(), Budget(10.0, 1000), fewest=fewest).steps == steps
+        assert trials.begin(Components(), Budget(10.0, 1000), fewest=fewest).trial.steps == steps
     assert trials.begin(Components(), Budget(10.0, 1000), fewest=24) is None
     assert gone[-1] == 20
     assert trials.begin(Components(), Budget(10.0, 5), fewest=50) is None

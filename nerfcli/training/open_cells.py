@@ -101,14 +101,6 @@ class Occupancy:
         chosen = self.optical_depth.view(-1)[cells]
         chosen.copy_(torch.maximum(torch.where(chosen.isinf(), 0.0, chosen * DECAY), depths))
 
-    def state(self) -> dict[str, Tensor]:
-        """Return the state for `restore`."""
-        return {"optical_depth": self.optical_depth}
-
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Restore the state that `state` returned."""
-        self.optical_depth = tensors["optical_depth"]
-
 
 OCCUPANCY_SIDE = 64
 REFRESH_EVERY = 8
@@ -202,14 +194,14 @@ class OpenCells:
 
     def state(self) -> dict[str, Tensor]:
         """Return the state for `restore`."""
-        tensors = {**self._occupancy.state(), "occupied": self.coarse}
+        tensors = {"optical_depth": self._occupancy.optical_depth, "occupied": self.coarse}
         if self.cell_depths is not None:
             tensors |= {"fine_depth": self._depths, "fine_visits": self.cell_depths, "fine_occupied": self._fine}
         return tensors
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Restore what `state` returned."""
-        self._occupancy.restore(tensors)
+        self._occupancy.optical_depth = tensors["optical_depth"]
         # Not recomputed: the threshold changes between two refreshes, the open cells do not.
         self.coarse = tensors["occupied"]
         if self.cell_depths is not None:

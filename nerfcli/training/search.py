@@ -123,9 +123,9 @@ class Search:
 
     def __init__(self, trials: Trials, start: TrialStart, requested: Components, *, budget: Budget, began: float):
         self._trials, self._start, self._requested = trials, start, requested
-        self._budget, self._began, self._steps = budget, began, start.steps
-        self._length = max(1, round(STEPS_OF_START * start.steps))
-        self._seconds_each = start.seconds * self._length / start.steps
+        self._budget, self._began, self._steps = budget, began, start.trial.steps
+        self._length = max(1, round(STEPS_OF_START * self._steps))
+        self._seconds_each = start.seconds * self._length / self._steps
         self.decisions: dict[Change, Decision] = {}
         # Trials of the components kept so far, one per seed.
         self._base: list[Trial] = []

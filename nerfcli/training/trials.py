@@ -185,11 +185,6 @@ class TrialStart:
     trial: Trial
     signs: Diagnostics
 
-    @property
-    def steps(self) -> int:
-        """Number of its steps."""
-        return self.trial.steps
-
 
 class Trials:
     """Trainings of one scene on the same pixels.
