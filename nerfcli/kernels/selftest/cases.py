@@ -2,7 +2,7 @@
 
 Rays are hard for rounding: thin and opaque, empty and dense, short and very long. Points are on borders and far away.
 
-Densities and interval lengths of `Group`s are exact in bfloat16, so that every precision gets the same rays and errors
+Densities and interval lengths of `groups` are exact in bfloat16, so that every precision gets the same rays and errors
 come from the arithmetic alone.
 """
 
@@ -37,14 +37,6 @@ class Segments:
     lengths: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class Group:
-    """Rays that are hard for the same reason."""
-
-    name: str
-    rays: tuple[Segments, ...]
-
-
 def coarse(value: float) -> float:
     """Round to the nearest bfloat16 number."""
     return torch.tensor(value, dtype=torch.float64).to(torch.bfloat16).item()
@@ -56,62 +48,47 @@ def fog(optical_depth: float, samples: int) -> Segments:
     return Segments(tuple(densities[k % 5] for k in range(samples)), tuple(2.0 ** -(6 + k % 3) for k in range(samples)))
 
 
-def groups() -> tuple[Group, ...]:
-    """Return the rays for weights, colours and their gradients."""
+def groups() -> dict[str, tuple[Segments, ...]]:
+    """Return the rays for weights, colours and their gradients, by what makes them hard."""
     counts = (1, 2, 64, 1024, 4096)
-    return (
-        *(
-            Group(f"optical depth {x:g} per interval, 1 to 4096", tuple(fog(x, n) for n in counts))
+    return {
+        **{
+            f"optical depth {x:g} per interval, 1 to 4096": tuple(fog(x, n) for n in counts)
             for x in (1e-12, 1e-9, 1e-6, 1e-3, 0.1, 1.0, 30.0, 1e6)
+        },
+        "no intervals": (Segments((), ()), Segments((), ())),
+        "zero weights: empty intervals": (Segments((0.0,) * 5, (0.5,) * 5), Segments((0.0,), (4.0,))),
+        "duplicate edges: intervals of length 0": (
+            Segments((1.0, 2.0, 4.0), (0.0, 0.5, 0.0)),
+            Segments((LARGEST, 1.0, 0.0), (0.0, 0.25, 0.0)),
+            Segments((1.0, 1.0), (0.0, 0.0)),
         ),
-        Group("no intervals", (Segments((), ()), Segments((), ()))),
-        Group("zero weights: empty intervals", (Segments((0.0,) * 5, (0.5,) * 5), Segments((0.0,), (4.0,)))),
-        Group(
-            "duplicate edges: intervals of length 0",
-            (
-                Segments((1.0, 2.0, 4.0), (0.0, 0.5, 0.0)),
-                Segments((LARGEST, 1.0, 0.0), (0.0, 0.25, 0.0)),
-                Segments((1.0, 1.0), (0.0, 0.0)),
-            ),
+        "first interval opaque": (
+            Segments((2.0**20, 1.0, 2.0), (1.0, 0.5, 0.5)),
+            Segments((2.0**100, 0.0, 2.0**100), (1.0, 1.0, 1.0)),
         ),
-        Group(
-            "first interval opaque",
-            (Segments((2.0**20, 1.0, 2.0), (1.0, 0.5, 0.5)), Segments((2.0**100, 0.0, 2.0**100), (1.0, 1.0, 1.0))),
+        "thin fog, then an opaque interval": (
+            Segments((2.0**-30,) * 64 + (2.0**20,), (2.0**-6,) * 65),
+            Segments((2.0**-20,) * 64 + (16.0, 2.0**20, 4.0), (2.0**-6,) * 64 + (1.0, 1.0, 1.0)),
         ),
-        Group(
-            "thin fog, then an opaque interval",
-            (
-                Segments((2.0**-30,) * 64 + (2.0**20,), (2.0**-6,) * 65),
-                Segments((2.0**-20,) * 64 + (16.0, 2.0**20, 4.0), (2.0**-6,) * 64 + (1.0, 1.0, 1.0)),
-            ),
+        "last interval very long, up to 1e38": (
+            Segments((0.5, 2.0**-40), (1.0, 2.0**40)),
+            Segments((0.5, 0.0), (1.0, 2.0**126)),
+            Segments((0.5, 1.0), (1.0, 2.0**126)),
+            Segments((0.5, 2.0**-126), (1.0, 2.0**126)),
         ),
-        Group(
-            "last interval very long, up to 1e38",
-            (
-                Segments((0.5, 2.0**-40), (1.0, 2.0**40)),
-                Segments((0.5, 0.0), (1.0, 2.0**126)),
-                Segments((0.5, 1.0), (1.0, 2.0**126)),
-                Segments((0.5, 2.0**-126), (1.0, 2.0**126)),
-            ),
+        "densities at overflow, product beyond float32": (
+            Segments((LARGEST,), (2.0**-6,)),
+            Segments((1.0, LARGEST, 1.0), (0.5, 4.0, 0.5)),
+            Segments((LARGEST, LARGEST, LARGEST), (4.0, 4.0, 4.0)),
+            Segments((LARGEST, LARGEST), (0.0, 0.0)),
         ),
-        Group(
-            "densities at overflow, product beyond float32",
-            (
-                Segments((LARGEST,), (2.0**-6,)),
-                Segments((1.0, LARGEST, 1.0), (0.5, 4.0, 0.5)),
-                Segments((LARGEST, LARGEST, LARGEST), (4.0, 4.0, 4.0)),
-                Segments((LARGEST, LARGEST), (0.0, 0.0)),
-            ),
+        "two surfaces, shells and slabs": (
+            Segments((44.5, 0.0, 2.0**14), (2.0**-6, 4.0, 2.0**-6)),
+            Segments((0.0, 2.0**13, 0.0), (2.0, 2.0**-13, 4.0)),
+            Segments((0.5, 1.0, 2.0), (1.0, 1.0, 1.0)),
         ),
-        Group(
-            "two surfaces, shells and slabs",
-            (
-                Segments((44.5, 0.0, 2.0**14), (2.0**-6, 4.0, 2.0**-6)),
-                Segments((0.0, 2.0**13, 0.0), (2.0, 2.0**-13, 4.0)),
-                Segments((0.5, 1.0, 2.0), (1.0, 1.0, 1.0)),
-            ),
-        ),
-    )
+    }
 
 
 def deepest_ray(rays: list[Segments], precision: Precision) -> tuple[int, float]:

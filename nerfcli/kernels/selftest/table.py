@@ -95,13 +95,13 @@ def checks() -> Iterator[Check]:
 
 def light_checks() -> Iterator[Check]:
     """Yield the cases of compositing, optical depths and distortion."""
-    for group in cases.groups():
+    for name, rays in cases.groups().items():
         yield Check(
-            group.name,
+            name,
             "composite",
-            partial(operations.light_inputs, group.rays),
+            partial(operations.light_inputs, rays),
             operations.composite,
-            partial(operations.light_bound, group.rays),
+            partial(operations.light_bound, rays),
             "u (8 + (n + 2) (1 + tau)), n and tau as far as light comes, compiled 8 u; twice for a gradient, relative "
             "to its terms",
             formula="1 - exp, cumulative product, 1 - sum of weights",
