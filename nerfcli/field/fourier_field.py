@@ -26,6 +26,7 @@ class FourierFieldSettings(FieldSettings):
     """
 
     kind: ClassVar[str] = "mlp"
+    closing_steps: ClassVar[int] = 600
 
     octaves: int = 10
     width: int = 128
@@ -44,7 +45,6 @@ class FourierField(Field):
     """
 
     settings: FourierFieldSettings
-    closing_steps = 600
 
     def __init__(self, settings: FourierFieldSettings):
         super().__init__(settings)

@@ -17,9 +17,12 @@ class FieldSettings(abc.ABC):
     Args:
         contraction: how space is mapped into the unit cube, one of `kernels.CONTRACTIONS`.
         view_degree: highest degree of the direction's spherical harmonics that colours depend on, 0 (not at all) to 3.
+
+    In a training, rays skip all cells that hold little after at most `closing_steps` steps.
     """
 
     kind: ClassVar[str]
+    closing_steps: ClassVar[int] = 150
 
     contraction: str
     view_degree: int = 3
@@ -48,14 +51,13 @@ class Field(nn.Module, abc.ABC):
     """Density by position, colour by position and direction, on the unit cube of `kernels.grid_coordinates`.
 
     `backend` renders `medium`. Each kind has its own settings for training: `rate_factor` multiplies the learning rate,
-    `row_decay` is the weight decay of rows, see `reference.adam_rows`, and after at most `closing_steps` steps, rays
-    skip all cells that hold little. A training sets `table_grad`, see `kernels.HashGrid`, for the gradient of `rows`.
+    `row_decay` is the weight decay of rows, see `reference.adam_rows`. A training sets `table_grad`, see
+    `kernels.HashGrid`, for the gradient of `rows`.
     """
 
     table_grad: Tensor | None = None
     rate_factor: float = 1.0
     row_decay: float = 0.0
-    closing_steps: ClassVar[int] = 150
 
     def __init__(self, settings: FieldSettings) -> None:
         super().__init__()

@@ -28,11 +28,6 @@ def fresh_field(settings: FieldSettings) -> Field:
     return _FIELDS[type(settings)](settings)
 
 
-def closing_steps(settings: FieldSettings) -> int:
-    """Return `Field.closing_steps` of a field with these settings."""
-    return _FIELDS[type(settings)].closing_steps
-
-
 def settings_from_json(content: dict[str, Any]) -> FieldSettings:
     """Read settings from `FieldSettings.to_json`.
 

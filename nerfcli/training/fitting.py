@@ -116,13 +116,7 @@ class Fitting:
         gains = inputs.log_gains
         gains = torch.full((len(pool.first_pixel), 3), torch.nan) if gains is None else gains
         self.appearance = Appearance(components, pool, log_gains=gains, log_focal=inputs.log_focal)
-        self.schedule = Schedule(
-            settings,
-            self.extent.parallax,
-            cameras_from,
-            has_large_table=self.field.settings.detailed,
-            closing_steps=self.field.closing_steps,
-        )
+        self.schedule = Schedule(settings, self.extent.parallax, cameras_from, self.field.settings)
         self.cells = OpenCells(self.field, self.extent.marching, device)
         if sky is not None:
             self.appearance.init_background_from_sky(sky)

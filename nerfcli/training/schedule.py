@@ -11,6 +11,7 @@ from math import cos, pi
 
 import numpy as np
 
+from nerfcli.field.interface import FieldSettings
 from nerfcli.training.runs.components import LEARNED_BACKGROUNDS, Components
 from nerfcli.training.runs.settings import TrainSettings
 
@@ -165,15 +166,13 @@ class Schedule:
         parallax: of the capture, see `Extent`; below 1 with a narrow baseline.
         cameras_from: the progress at which cameras start to learn, for a training that goes on from one with fixed
             cameras.
-        has_large_table: whether the field is one of long trainings.
-        closing_steps: the steps after which open cells have the last threshold.
+        field: kind and size.
     """
 
     settings: TrainSettings
     parallax: float
     cameras_from: float
-    has_large_table: bool
-    closing_steps: int
+    field: FieldSettings
 
     def at(self, progress: float, *, step: int, furthest: float) -> StepPlan:
         """Return the plan of a step.
@@ -185,7 +184,7 @@ class Schedule:
                 at a smaller one, and keeps its detail and its closed cells.
         """
         components = self.settings.components
-        closed = min(1.0, max(step / self.closing_steps, furthest / CLOSING_ENDS))
+        closed = min(1.0, max(step / self.field.closing_steps, furthest / CLOSING_ENDS))
         # Photos do not improve on the distances of a sensor: these keep their weight.
         of_points = 1.0 if components.sensor else point_weight(progress, step, self.parallax)
         return StepPlan(
@@ -211,7 +210,7 @@ class Schedule:
         """Return the detail of the field, 1 or more for all; cameras that learn late do not delay it."""
         if self.cameras_from == 0.0 and self.settings.components.cameras != "fixed":
             furthest = (1.0 - DETAIL_DELAY) * furthest - DETAIL_DELAY
-        elif self.cameras_from == 0.0 and self.has_large_table:
+        elif self.cameras_from == 0.0 and self.field.detailed:
             furthest = min(1.0, max(furthest, step / LARGE_TABLE_STEPS))
         return furthest / DETAILED_PROGRESS
 

@@ -21,7 +21,7 @@ from nerfcli.captures.loading import (
 from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.errors import UserError, duration, listed, several
 from nerfcli.field.hash_field import HashFieldSettings
-from nerfcli.field.kinds import chosen_size, closing_steps, parameter_bytes
+from nerfcli.field.kinds import chosen_size, parameter_bytes
 from nerfcli.machine import Resources, is_one_of_several
 from nerfcli.notices import Reporter, silent
 from nerfcli.output import Output
@@ -320,10 +320,4 @@ def _likely_schedule(settings: TrainSettings) -> Schedule:
         footprint=LIKELY_FOOTPRINT,
         memory_bytes=settings.field_memory_bytes,
     )
-    return Schedule(
-        replace(settings, components=components),
-        parallax=1.0,
-        cameras_from=0.0,
-        has_large_table=size.detailed,
-        closing_steps=closing_steps(size),
-    )
+    return Schedule(replace(settings, components=components), parallax=1.0, cameras_from=0.0, field=size)
