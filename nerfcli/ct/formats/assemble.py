@@ -34,12 +34,13 @@ class ReaderOutput:
         geometry: a circle where the format states one, else vectors.
         unit: unit of lengths, such as "mm" or `UNKNOWN_UNIT`.
         beam: the open beam, for counts.
-        photons: number of photons for a transmission of 1, if the values are not counts.
+        photons: number of photons per pixel of the open beam, if stated.
         held_out: views that the format holds out; None if it does not state any.
         names: names of the views, for error messages.
         notes: notes for the user.
         history: further entries for `Scan.history`.
-        stated_mm: millimetres per unit of length in the file, already applied; 1 if the file states no unit.
+        stated_mm: millimetres per unit of length in the file, already applied; 1 if the file states no unit, None if it
+            states no lengths.
     """
 
     path: Path
@@ -54,7 +55,7 @@ class ReaderOutput:
     names: Sequence[str] = ()
     notes: Sequence[str] = ()
     history: Mapping[str, Any] | None = None
-    stated_mm: float = 1.0
+    stated_mm: float | None = 1.0
 
 
 def scan_of(found: ReaderOutput, given: ScanOptions) -> Scan:
@@ -151,6 +152,11 @@ def _in_millimetres(found: ReaderOutput, given: ScanOptions) -> tuple[str, Circl
         raise UserError(
             f"--unit {given.unit} is not a unit of length", f"choose one of {', '.join(sorted(MILLIMETRES))}"
         )
+    if found.stated_mm is None:
+        raise UserError(
+            f"{found.path} states no pixel size, to which --unit {given.unit} would apply",
+            "store the size in the file as x_pixel_size, or leave out --unit: lengths are then in pixels",
+        )
     return "mm", found.geometry.scaled(factor / found.stated_mm)
 
 
@@ -215,10 +221,12 @@ def _photons(found: ReaderOutput, given: ScanOptions) -> float | None:
                 "--photons does not apply to line integrals: their noise is no longer that of counting",
                 "leave it out, or convert transmissions or counts",
             )
-        if found.beam is not None:
-            return given.photons / float(np.median(found.beam.values[found.beam.usable]))
-        return given.photons
-    return found.photons if found.beam is None else found.beam.photons_per_value
+    photons = found.photons if given.photons is None else given.photons
+    if found.beam is None:
+        return photons
+    if photons is None:
+        return found.beam.photons_per_value
+    return photons / float(np.median(found.beam.values[found.beam.usable]))
 
 
 def _held_out(found: ReaderOutput, given: ScanOptions, views: int) -> tuple[int, ...]:

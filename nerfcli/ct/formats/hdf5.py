@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.ct.formats.assemble import ReaderOutput, scan_of
-from nerfcli.ct.formats.statement import ScanOptions, angles_in_radians, millimetres
+from nerfcli.ct.formats.assemble import ReaderOutput
+from nerfcli.ct.formats.statement import angles_in_radians, millimetres
 from nerfcli.ct.geometry import Circle
 from nerfcli.ct.open_beam import check_sizes, open_beam_of
 from nerfcli.ct.recognise import datasets_in, open_hdf5
-from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
 
 # Names of the pixel size, in order of preference: the size at the object before that of the camera.
@@ -27,12 +26,8 @@ _PIXEL_HEIGHT = tuple(name.replace("_x", "_y").replace("x_", "y_") for name in _
 _PROJECTION, _FLAT, _DARK = 0, 1, 2
 
 
-def read_data_exchange(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
-    """Read a DataExchange file: exchange/data, data_white, data_dark and theta.
-
-    Raises:
-        UserError: it cannot be read, lacks something, or its parts do not fit together.
-    """
+def read_data_exchange(path: Path) -> ReaderOutput:
+    """Read a DataExchange file: exchange/data, data_white, data_dark and theta."""
     with open_hdf5(path) as file:
         data = _frames(file, "exchange/data", path)
         theta = _dataset(file, "exchange/theta", path, "the angles of the projections")
@@ -40,15 +35,11 @@ def read_data_exchange(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
         flats = _frames(file, "exchange/data_white", path) if "exchange/data_white" in file else None
         darks = _frames(file, "exchange/data_dark", path) if "exchange/data_dark" in file else None
         sides = _pixel_mm(file, path)
-    return _parallel(path, "data-exchange", data, angles, flats=flats, darks=darks, sides=sides, given=given)
+    return _parallel(path, "data-exchange", data, angles, flats=flats, darks=darks, sides=sides)
 
 
-def read_nxtomo(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
-    """Read a NeXus file with an NXtomo entry: frames with an image_key (0 projections, 1 flats, 2 darks).
-
-    Raises:
-        UserError: as for `read_data_exchange`.
-    """
+def read_nxtomo(path: Path) -> ReaderOutput:
+    """Read a NeXus file with an NXtomo entry: frames with an image_key (0 projections, 1 flats, 2 darks)."""
     with open_hdf5(path) as file:
         key_name = _first(file, "image_key", path)
         key = np.asarray(file[key_name][...]).reshape(-1)
@@ -78,7 +69,6 @@ def read_nxtomo(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
         flats=flats if len(flats) else None,
         darks=darks if len(darks) else None,
         sides=sides,
-        given=given,
     )
 
 
@@ -91,18 +81,12 @@ def _parallel(
     flats: np.ndarray | None,
     darks: np.ndarray | None,
     sides: tuple[float, float, float] | None,
-    given: ScanOptions,
-) -> Scan:
+) -> ReaderOutput:
     check_sizes(data.shape, flats=flats, darks=darks, path=path)
     notes = ["the file does not say which way the source moved: counter-clockwise around the object is assumed"]
-    width, height, stated = (1.0, 1.0, 1.0) if sides is None else sides
+    width, height, stated = (1.0, 1.0, None) if sides is None else sides
     circle = Circle("parallel", tuple(angles.tolist()), width, height, data.shape[1], data.shape[2])
     if sides is None:
-        if given.unit is not None:
-            raise UserError(
-                f"{path} states no pixel size, to which --unit {given.unit} would apply",
-                "store the size in the file as x_pixel_size, or leave out --unit: lengths are then in pixels",
-            )
         notes.append("the file does not state the pixel size: lengths are in pixels")
     beam = None
     if flats is None:
@@ -116,7 +100,7 @@ def _parallel(
         beam = open_beam_of(flats, darks)
     kind = "transmission" if beam is None else "counts"
     unit = "voxel" if sides is None else "mm"
-    return scan_of(ReaderOutput(path, form, data, kind, circle, unit, beam=beam, notes=notes, stated_mm=stated), given)
+    return ReaderOutput(path, form, data, kind, circle, unit, beam=beam, notes=notes, stated_mm=stated)
 
 
 def _dataset(file: Any, name: str, path: Path, what: str) -> Any:

@@ -9,21 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.ct.formats.assemble import ReaderOutput, scan_of
-from nerfcli.ct.formats.statement import ScanOptions, Statement, angles_in_radians, millimetres
+from nerfcli.ct.formats.assemble import ReaderOutput
+from nerfcli.ct.formats.statement import Statement, angles_in_radians, millimetres
 from nerfcli.ct.geometry import Circle
-from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
 
 _HINT = "expected a struct CtData with sinogram and parameters, as HelTomo writes it"
 
 
-def read_heltomo(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
-    """Read a .mat file with a struct of sinogram and parameters.
-
-    Raises:
-        UserError: it cannot be read or is another .mat file.
-    """
+def read_heltomo(path: Path) -> ReaderOutput:
+    """Read a .mat file with a struct of sinogram and parameters."""
     name, data = _struct(path)
     fields = Statement(path, vars(data.parameters), hint=_HINT)
     sinogram = np.asarray(data.sinogram, dtype=np.float32)
@@ -45,10 +40,9 @@ def read_heltomo(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     origin, detector = (unit * fields.positive(f"distanceSource{to}") for to in ("Origin", "Detector"))
     circle = Circle("cone", tuple((angles - np.pi / 2).tolist()), pixel, pixel, 1, columns, origin, detector)
     history = {"project": fields.text("projectName", path.stem)}
-    found = ReaderOutput(
+    return ReaderOutput(
         *(path, "heltomo", sinogram[:, None], "line_integral", circle, "mm"), history=history, stated_mm=unit
     )
-    return scan_of(found, given)
 
 
 def _struct(path: Path) -> tuple[str, Any]:

@@ -11,22 +11,17 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfcli.ct.formats.assemble import ReaderOutput, scan_of
+from nerfcli.ct.formats.assemble import ReaderOutput
 from nerfcli.ct.formats.pictures import numbered, read_stack
-from nerfcli.ct.formats.statement import ScanOptions, Statement, angles_in_radians, read_lines
+from nerfcli.ct.formats.statement import Statement, angles_in_radians, read_lines
 from nerfcli.ct.geometry import Circle
-from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
 
 _HINT = "a .xtekct file has SrcToObject, SrcToDetector, DetectorPixelsX, DetectorPixelSizeX, WhiteLevel and Projections"
 
 
-def read_nikon(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
-    """Read a .xtekct file with its projections.
-
-    Raises:
-        UserError: it cannot be read, lacks something, or its projections are missing.
-    """
+def read_nikon(path: Path) -> ReaderOutput:
+    """Read a .xtekct file with its projections."""
     fields = read_lines(path, hint=_HINT)
     views = fields.whole("Projections")
     columns, rows = fields.whole("DetectorPixelsX"), fields.whole("DetectorPixelsY")
@@ -58,7 +53,7 @@ def read_nikon(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
         mirrored=True,
     )
     values = read_stack(_projections(path, fields, views))
-    return scan_of(ReaderOutput(path, "nikon", values / white, "transmission", circle, "mm", notes=notes), given)
+    return ReaderOutput(path, "nikon", values / white, "transmission", circle, "mm", notes=notes)
 
 
 def _angles(fields: Statement, views: int, recorded: np.ndarray | None, notes: list[str]) -> np.ndarray:

@@ -9,24 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
+from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput
 from nerfcli.ct.formats.pictures import read_npy
-from nerfcli.ct.formats.statement import ScanOptions, Statement, angles_in_radians, read_object
+from nerfcli.ct.formats.statement import Statement, angles_in_radians, read_object
 from nerfcli.ct.geometry import Circle
 from nerfcli.ct.recognise import R2_GAUSSIAN
-from nerfcli.ct.scan import Scan
 from nerfcli.ct.truth import described_truth
 from nerfcli.errors import UserError
 
 _HINT = "expected R2-Gaussian's meta_data.json: scanner, proj_train and proj_test"
 
 
-def read_r2_gaussian(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
-    """Read a folder with a meta_data.json, or the meta_data.json itself; proj_test is held out.
-
-    Raises:
-        UserError: it cannot be read, lacks something, or its parts do not fit together.
-    """
+def read_r2_gaussian(path: Path) -> ReaderOutput:
+    """Read a folder with a meta_data.json, or the meta_data.json itself; proj_test is held out."""
     file = path / R2_GAUSSIAN if path.is_dir() else path
     meta = read_object(file, hint=_HINT)
     scanner = Statement(file, _mapping(meta.value("scanner"), "scanner", file), hint=_HINT)
@@ -73,14 +68,13 @@ def read_r2_gaussian(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
         row_shift=-up / height,
     )
     held_out = [view for view, (part, _) in enumerate(frames) if part == "proj_test"]
-    found = ReaderOutput(
+    return ReaderOutput(
         *(path, "r2-gaussian", np.stack(values), "line_integral", circle, UNKNOWN_UNIT),
         held_out=held_out or None,
         names=[str(frame.get("file_path")) for _, frame in frames],
         notes=["lengths have no unit in this format: attenuation is in 1 / its unit of length"],
         history=_truth(meta, scanner, file),
     )
-    return scan_of(found, given)
 
 
 def _projection(file: Path, frame: dict[str, Any]) -> np.ndarray:

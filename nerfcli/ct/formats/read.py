@@ -5,12 +5,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 from nerfcli.ct.formats import hdf5, heltomo, nikon, r2_gaussian, skyscan, stated_stack, transmission_transforms
+from nerfcli.ct.formats.assemble import ReaderOutput, scan_of
 from nerfcli.ct.formats.statement import ScanOptions
 from nerfcli.ct.recognise import OWN, files_of, recognise
 from nerfcli.ct.scan import Scan, load_scan
 from nerfcli.errors import UserError
 
-READERS: dict[str, Callable[[Path, ScanOptions], Scan]] = {
+# Reader of each format; its UserError says what cannot be read, is missing, or does not fit the rest.
+READERS: dict[str, Callable[[Path], ReaderOutput]] = {
     "data-exchange": hdf5.read_data_exchange,
     "nxtomo": hdf5.read_nxtomo,
     "r2-gaussian": r2_gaussian.read_r2_gaussian,
@@ -39,4 +41,4 @@ def read_scan(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
             raise UserError(f"{path} is a scan that was converted already", "set options when converting it")
         return load_scan(path if path.is_dir() else path.parent)
     files = files_of(path, form) if path.is_dir() else []
-    return READERS[form](files[0] if files else path, given)
+    return scan_of(READERS[form](files[0] if files else path), given)

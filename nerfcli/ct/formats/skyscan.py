@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfcli.ct.formats.assemble import ReaderOutput, scan_of
+from nerfcli.ct.formats.assemble import ReaderOutput
 from nerfcli.ct.formats.pictures import numbered, read_stack
-from nerfcli.ct.formats.statement import ScanOptions, Statement, angles_in_radians, read_lines
+from nerfcli.ct.formats.statement import Statement, angles_in_radians, read_lines
 from nerfcli.ct.geometry import Circle
-from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
 
 _HINT = "a SkyScan .log has Object to Source (mm), Image Pixel Size (um), Rotation Step (deg) and Number of Files"
@@ -23,12 +22,8 @@ _OTHERS = r"(_rec|_spr|_arc|_TS)\w*\.\w+$"
 _PARALLEL = 1000.0
 
 
-def read_skyscan(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
-    """Read a .log file with its projections.
-
-    Raises:
-        UserError: it cannot be read, lacks something, or its projections are missing.
-    """
+def read_skyscan(path: Path) -> ReaderOutput:
+    """Read a .log file with its projections."""
     fields = read_lines(path, hint=_HINT)
     step = fields.number("Rotation Step (deg)")
     to_object = fields.positive("Object to Source (mm)")
@@ -70,7 +65,7 @@ def read_skyscan(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
             "--detect estimates the centre of rotation"
         )
     white = _white(fields, values, notes)
-    return scan_of(ReaderOutput(path, "skyscan", values / white, "transmission", circle, "mm", notes=notes), given)
+    return ReaderOutput(path, "skyscan", values / white, "transmission", circle, "mm", notes=notes)
 
 
 def _white(fields: Statement, values: np.ndarray, notes: list[str]) -> float:

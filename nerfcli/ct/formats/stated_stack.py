@@ -25,19 +25,18 @@
 | vectors | instead of angles and distances: views x 12 numbers as ASTRA's cone_vec or parallel3d_vec |
 """
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nerfcli.ct.formats.assemble import ReaderOutput, scan_of
+from nerfcli.ct.formats.assemble import ReaderOutput
 from nerfcli.ct.formats.pictures import SUFFIXES, numbered, read_npy, read_stack
-from nerfcli.ct.formats.statement import ScanOptions, Statement, angles_in_radians, millimetres, read_object
+from nerfcli.ct.formats.statement import Statement, angles_in_radians, millimetres, read_object
 from nerfcli.ct.geometry import Beam, Circle, ScanGeometry, from_vectors
 from nerfcli.ct.open_beam import OpenBeam, check_sizes, open_beam_of
 from nerfcli.ct.recognise import STACK
-from nerfcli.ct.scan import KINDS, Kind, Scan
+from nerfcli.ct.scan import KINDS, Kind
 from nerfcli.ct.truth import described_truth
 from nerfcli.errors import UserError
 
@@ -49,12 +48,8 @@ _KEYS = (
 )
 
 
-def read_stated_stack(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
-    """Read a folder with a scan.json, or the scan.json itself.
-
-    Raises:
-        UserError: it cannot be read, states something unknown, lacks something, or does not fit the pictures.
-    """
+def read_stated_stack(path: Path) -> ReaderOutput:
+    """Read a folder with a scan.json, or the scan.json itself."""
     file = path / STACK if path.is_dir() else path
     fields = read_object(file, hint=_HINT)
     unknown = [name for name in fields.names if name not in _KEYS]
@@ -72,17 +67,14 @@ def read_stated_stack(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
     measured: Kind = next(name for name in KINDS if name == kind)
     beam = _open_beam(file, fields, values.shape) if measured == "counts" else None
     photons = fields.positive("photons") if "photons" in fields else None
-    found = ReaderOutput(
+    return ReaderOutput(
         *(path, "stack", values, measured, geometry, "mm"),
         beam=beam,
-        photons=photons if beam is None else None,
+        photons=photons,
         held_out=_held_out(fields, views),
         history=_truth(fields, factor),
         stated_mm=factor,
     )
-    if photons is not None and given.photons is None and measured != "line_integral":
-        given = replace(given, photons=photons)
-    return scan_of(found, given)
 
 
 def _circle(fields: Statement, beam: Beam, *, views: int, rows: int, columns: int) -> Circle:

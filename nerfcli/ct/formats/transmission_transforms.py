@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput, scan_of
+from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput
 from nerfcli.ct.formats.pictures import read_npy, read_stack
-from nerfcli.ct.formats.statement import ScanOptions, Statement, read_object
+from nerfcli.ct.formats.statement import Statement, read_object
 from nerfcli.ct.geometry import ScanGeometry, circle_of
 from nerfcli.ct.recognise import TRANSFORMS, TRANSFORMS_GEOMETRY
-from nerfcli.ct.scan import Scan
 from nerfcli.ct.truth import described_truth
 from nerfcli.errors import UserError
 
@@ -24,12 +23,8 @@ WHITE = 65535.0
 _HINT = "expected geometry.json, transforms_train.json and transforms_test.json, with transmissions"
 
 
-def read_transmission_transforms(path: Path, given: ScanOptions = ScanOptions()) -> Scan:
-    """Read the folder, one of its JSON files, or a .npy in it with the projections in the order of their angles.
-
-    Raises:
-        UserError: it cannot be read, lacks something, or its parts do not fit together.
-    """
+def read_transmission_transforms(path: Path) -> ReaderOutput:
+    """Read the folder, one of its JSON files, or a .npy in it with the projections in the order of their angles."""
     folder = path if path.is_dir() else path.parent
     stated = read_object(folder / TRANSFORMS_GEOMETRY, hint=_HINT)
     frames, lens = _frames(folder)
@@ -59,7 +54,7 @@ def read_transmission_transforms(path: Path, given: ScanOptions = ScanOptions())
     geometry = geometry.shifted(columns / 2 - lens.number("cx"), rows / 2 - lens.number("cy"))
     values, kind, photons = _values(path, folder, frames)
     circle, apart = circle_of(geometry)
-    found = ReaderOutput(
+    return ReaderOutput(
         *(path, "transmission-transforms", values),
         kind="line_integral" if kind == "line_integral" else "transmission",
         geometry=circle if apart < 1e-6 else geometry,
@@ -69,7 +64,6 @@ def read_transmission_transforms(path: Path, given: ScanOptions = ScanOptions())
         names=[str(frame["file_path"]) for frame in frames],
         history=_truth(folder, stated),
     )
-    return scan_of(found, given)
 
 
 def _frames(folder: Path) -> tuple[list[dict[str, Any]], Statement]:
