@@ -22,10 +22,9 @@ from nerfcli.evaluate.billboards import (
     gain_error_db,
     random_pixels,
 )
-from nerfcli.evaluate.metrics import to_8_bit
-from nerfcli.evaluate.photos import HeldOutPhoto, over_white
+from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.evaluate.protocol import Extras, evaluate_model
-from nerfcli.photos.colours import psnr_of
+from nerfcli.photos.colours import over_white, psnr_of, to_8_bit
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import load_model
 

@@ -14,10 +14,11 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit, whole_windows
-from nerfcli.evaluate.photos import HeldOutPhoto, over_white
+from nerfcli.evaluate.metrics import psnr, ssim, whole_windows
+from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.evaluate.protocol import evaluate_model
 from nerfcli.field.exposure import exposed
+from nerfcli.photos.colours import over_white, to_8_bit
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.training.checkpoints import HeldoutPixels
 from nerfcli.training.pool import PixelPool

@@ -29,11 +29,12 @@ from nerfcli.captures.formats.run_cameras import read_cameras, write_cameras
 from nerfcli.captures.holdout import default_split
 from nerfcli.captures.loading import fingerprint
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.evaluate.photos import HeldOutPhoto, over_white
+from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.evaluate.protocol import evaluate_model
 from nerfcli.field import hash_field
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.machine import peak_resident_bytes
+from nerfcli.photos.colours import over_white
 from nerfcli.photos.images import read_image, write_png
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.files.float_maps import read_tiff

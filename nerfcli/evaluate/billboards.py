@@ -18,8 +18,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import centres_of, focus_point, views_of
 from nerfcli.cameras.rigid import apply, inverse
 from nerfcli.errors import reason_of
-from nerfcli.evaluate.metrics import to_8_bit
-from nerfcli.photos.colours import psnr_of
+from nerfcli.photos.colours import psnr_of, to_8_bit
 from nerfcli.photos.images import downscale
 
 # Largest side of the photos on the billboards; a model without geometry is off by more than one of these pixels.

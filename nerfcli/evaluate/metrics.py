@@ -18,7 +18,7 @@ import torch
 from scipy.ndimage import minimum_filter
 from skimage.metrics import structural_similarity
 
-from nerfcli.photos.colours import psnr_of
+from nerfcli.photos.colours import psnr_of, to_8_bit
 
 # From Wang et al.: the Gaussian's standard deviation, and the width at which scikit-image cuts it off (3.5 sigma).
 SIGMA = 1.5
@@ -104,11 +104,6 @@ def compare_fully(
         ssim_colour_aligned=aligned.ssim,
         lpips_colour_aligned=_lpips(to_8_bit(corrected), photo, used=used, perceptual=perceptual),
     )
-
-
-def to_8_bit(picture: np.ndarray) -> np.ndarray:
-    """Convert colours in [0, 1] to 8 bits as in a PNG: clipped, rounded to the nearest of 256 levels."""
-    return np.round(np.clip(picture, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def as_float(picture: np.ndarray) -> np.ndarray:

@@ -20,9 +20,9 @@ import torch
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.evaluate.billboards import Billboards, reduction
-from nerfcli.evaluate.metrics import to_8_bit
 from nerfcli.field.background import Background
 from nerfcli.field.exposure import changed_in_front, exposed
+from nerfcli.photos.colours import over_white, to_8_bit
 from nerfcli.photos.held_out_exposure import gain_sources, log_gains_of
 from nerfcli.photos.images import write_png
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photo, load_photos
@@ -68,14 +68,6 @@ class ComparedImages:
 def background_of(model: Renderable, photo: HeldOutPhoto) -> Background:
     """Return the background of pictures that are compared with a photo: white if the photo has alpha."""
     return (1.0, 1.0, 1.0) if photo.pixels.shape[-1] == 4 else model.background
-
-
-def over_white(pixels: np.ndarray) -> np.ndarray:
-    """Return RGBA composited on white as 8-bit RGB, as in published tables; RGB unchanged."""
-    if pixels.shape[-1] == 3:
-        return pixels
-    alpha = pixels[..., 3:].astype(np.float64) / 255.0
-    return to_8_bit(pixels[..., :3] / 255.0 * alpha + 1.0 - alpha)
 
 
 def paired(photo: HeldOutPhoto, picture: RenderedPicture) -> ComparedImages:

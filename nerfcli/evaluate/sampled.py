@@ -8,9 +8,10 @@ import torch
 
 from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import compare
-from nerfcli.evaluate.photos import HeldOutPhoto, as_exposed, background_of, over_white
+from nerfcli.evaluate.photos import HeldOutPhoto, as_exposed, background_of
 from nerfcli.evaluate.protocol import PROTOCOL
 from nerfcli.field.background import colours_behind
+from nerfcli.photos.colours import over_white
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import Renderable
 from nerfcli.render.tracing import pixel_rays, render_rays

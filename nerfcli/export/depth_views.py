@@ -9,6 +9,7 @@ import torch
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import from_parts, rotation_from_vector
+from nerfcli.photos.colours import to_8_bit
 from nerfcli.photos.loading import pinhole_of
 from nerfcli.render.coverage import DepthMap, normals_of_points
 from nerfcli.render.depth import DepthRequest
@@ -147,7 +148,7 @@ def surface_colours(model: Model, points: np.ndarray, normals: np.ndarray, *, vo
     thin = opacity < 0.1
     if thin.any():
         colours[thin] = point_colours(model, points[thin])
-    return np.rint(255 * np.clip(colours, 0.0, 1.0)).astype(np.uint8)
+    return to_8_bit(colours)
 
 
 def point_colours(model: Model, points: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from nerfcli.export.depth_views import DepthView, plane_rays
 from nerfcli.export.extent import Grid
+from nerfcli.photos.colours import to_8_bit
 from nerfcli.render.coverage import largest_angle_deg, sees
 
 # Voxels along a side of a block.
@@ -248,7 +249,7 @@ def _thinned(views: Sequence[DepthView], grid: Grid) -> tuple[np.ndarray, np.nda
         cells = np.floor((places - grid.low) / grid.voxel_size).astype(np.int64)
         inside = ((cells >= 0) & (cells < grid.shape)).all(-1)
         normals = view.normals[sure][inside] @ view.frame.world_from_cam[:3, :3].T
-        levels = np.rint(255 * np.clip(view.rgb[sure][inside], 0, 1)).astype(np.uint8)
+        levels = to_8_bit(view.rgb[sure][inside])
         keys = np.asarray(np.ravel_multi_index(tuple(cells[inside].T), grid.shape))
         spread = np.nan_to_num(view.spread[sure][inside], nan=np.inf)
         # Thin out each view first: most of its pixels share voxels with their neighbours.

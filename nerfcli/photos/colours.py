@@ -1,4 +1,4 @@
-"""Colours: the transfer function of sRGB, the PSNR of a difference, and perceptual colour maps from matplotlib."""
+"""Colours: sRGB and linear light, 8 bits, alpha on white, the PSNR of a difference, colour maps from matplotlib."""
 
 import math
 from functools import cache
@@ -15,6 +15,19 @@ def linear_light(srgb: np.ndarray) -> np.ndarray:
     low = srgb / 12.92
     high = ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4
     return np.where(srgb <= 0.04045, low, high).astype(srgb.dtype)
+
+
+def to_8_bit(colours: np.ndarray) -> np.ndarray:
+    """Convert colours in [0, 1] to 8 bits as in a PNG: clipped, rounded to the nearest of 256 levels."""
+    return np.round(np.clip(colours, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def over_white(pixels: np.ndarray) -> np.ndarray:
+    """Return 8-bit RGBA composited on white as 8-bit RGB, as in published tables; RGB unchanged."""
+    if pixels.shape[-1] == 3:
+        return pixels
+    alpha = pixels[..., 3:].astype(np.float64) / 255.0
+    return to_8_bit(pixels[..., :3] / 255.0 * alpha + 1.0 - alpha)
 
 
 def psnr_of(error: float) -> float:

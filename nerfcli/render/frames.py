@@ -30,6 +30,7 @@ from nerfcli.field.background import Background, SphereBackground
 from nerfcli.machine import use_threads
 from nerfcli.notices import Reporter
 from nerfcli.output import Output
+from nerfcli.photos.colours import to_8_bit
 from nerfcli.photos.images import write_png
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
 from nerfcli.render.accuracy import truncation_bounds
@@ -326,14 +327,10 @@ def _write_outputs(
         behind = "none: straight alpha" if settings.rgba else behind
         error = {f"error {name}": str(value) for name, value in meta.error_bounds.items()}
         metadata = {"colour": "sRGB", "background": behind, **error, "nerfcli": __version__}
-        write_png(with_suffix(folder / "rgb" / name, ".png"), _to_bytes(picture.rgb), metadata=metadata)
+        write_png(with_suffix(folder / "rgb" / name, ".png"), to_8_bit(picture.rgb), metadata=metadata)
     if "opacity" in settings.outputs:
         metadata = {"quantity": "opacity: 0 transparent, 255 opaque", "nerfcli": __version__}
-        grey = np.repeat(_to_bytes(picture.opacity)[..., None], 3, axis=-1)
+        grey = np.repeat(to_8_bit(picture.opacity)[..., None], 3, axis=-1)
         write_png(with_suffix(folder / "opacity" / name, ".png"), grey, metadata=metadata)
     if settings.measured:
         write_maps(picture, folder, name, settings=settings, meta=meta)
-
-
-def _to_bytes(values: np.ndarray) -> np.ndarray:
-    return np.round(np.clip(values, 0.0, 1.0) * 255.0).astype(np.uint8)

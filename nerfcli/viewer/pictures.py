@@ -13,6 +13,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import centres_of
 from nerfcli.pages.page import data_uri, jpeg_bytes
+from nerfcli.photos.colours import over_white
 from nerfcli.photos.held_out_exposure import PhotoExposures, log_gains_of
 from nerfcli.photos.loading import load_photo, pinhole_of, undistorted
 from nerfcli.render.depth import DepthRequest
@@ -26,7 +27,6 @@ QUALITY = 80
 MOST_PICTURES = 200
 # Number of photos that are encoded to choose the size of all.
 _SAMPLE = 4
-_WHITE = 255.0
 
 
 @dataclass(frozen=True)
@@ -152,10 +152,7 @@ def _small_photo(frame: Frame, longest_px: int) -> np.ndarray:
     photo = load_photo(replace(frame, mask=None), factor, "ignore")  # masks are not shown
     small = photo.frame.camera
     pixels, _ = undistorted(photo.pixels, small, pinhole_of(small))
-    if pixels.shape[-1] == 4:
-        alpha = pixels[..., 3:] / _WHITE
-        pixels = np.rint(pixels[..., :3] * alpha + _WHITE * (1 - alpha)).astype(np.uint8)
-    return pixels
+    return over_white(pixels)
 
 
 WIDTH, HEIGHT = 64, 48

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.evaluate.metrics import Metrics, compare, to_8_bit
+from nerfcli.evaluate.metrics import Metrics, compare
 from nerfcli.evaluate.photos import HeldOutPhoto, background_of, paired
 from nerfcli.evaluate.report.run_facts import RunFacts
-from nerfcli.photos.colours import levels_of
+from nerfcli.photos.colours import levels_of, to_8_bit
 from nerfcli.render.coverage import DepthMap, small_frame, with_coverage
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
@@ -129,8 +129,7 @@ def error_map(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> np
         (H, W, 3) uint8.
     """
     difference = np.abs(picture.astype(np.float64) - photo).mean(-1) / 255.0
-    level = np.rint(np.clip(difference / ERROR_RANGE, 0.0, 1.0) * 255.0).astype(np.uint8)
-    colours = levels_of(ERROR_COLOURS)[level]
+    colours = levels_of(ERROR_COLOURS)[to_8_bit(difference / ERROR_RANGE)]
     colours[~used] = 128
     return colours
 
