@@ -80,7 +80,7 @@ def test_fit_beats_the_baselines_with_the_same_views(scan: Scan, grid: VoxelGrid
     _, error = found_noise(scan, scan.geometry, grid, seconds=None)
     problem = problem_of(scan, grid)
     assert isinstance(problem.likelihood, Poisson)
-    problem = replace(problem, likelihood=problem.likelihood.with_model_error(error))
+    problem = replace(problem, likelihood=replace(problem.likelihood, model_error=error))
     integrals, geometry = scan.line_integrals(views), scan.geometry.select(views)
     true = truth(grid)
     found = {

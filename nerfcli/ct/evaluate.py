@@ -192,11 +192,9 @@ def score_projections(
         return None
     every = np.arange(len(views))
     predicted = Projector(geometry.select(views), grid).forward(volume, every)
-    likelihood = likelihood_of(scan, views)
+    likelihood = likelihood_of(scan, views, air=air)
     measured = scan.line_integrals(views).reshape(len(views), -1)
     if air is not None:
-        assert isinstance(likelihood, Poisson)
-        likelihood = likelihood.scaled(torch.from_numpy(air.astype(np.float32)))
         measured = measured + np.log(air)[:, None].astype(np.float32)
     deviance = likelihood.deviance(predicted, torch.from_numpy(every)).numpy()
     usable = np.isfinite(deviance) & np.isfinite(measured)

@@ -9,6 +9,7 @@ likelihoods are negative logarithms, view by view; tensors are (views, pixels), 
     suggested    line integrals estimated directly from the data, to start a fit; NaN for unusable pixels
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -65,20 +66,12 @@ class Poisson:
         signal = (self.counts[views] - self.background[views]).clamp_min(0.5)
         return torch.where(self.open_beam[views] > 0, torch.log(self.open_beam[views] / signal), torch.nan)
 
-    def scaled(self, factors: Tensor) -> "Poisson":
-        """Return the same counts with the open beam multiplied by one factor per view (views,)."""
-        return replace(self, open_beam=self.open_beam * factors[:, None])
-
-    def with_model_error(self, error: float) -> "Poisson":
-        """Return the same counts for a model whose line integrals have this standard error."""
-        return replace(self, model_error=error)
-
     def found_model_error(self, integrals: Tensor, views: Tensor) -> float:
         """Estimate the model error, at most 1, that makes the mean deviance 1; 0 if no error is needed."""
         low, high = 0.0, 1.0
 
         def excess(error: float) -> float:
-            return float(torch.nanmean(self.with_model_error(error).deviance(integrals, views))) - 1
+            return float(torch.nanmean(replace(self, model_error=error).deviance(integrals, views))) - 1
 
         if excess(low) <= 0:
             return 0.0
@@ -114,7 +107,14 @@ class Gaussian:
 Likelihood = Poisson | Gaussian
 
 
-def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Likelihood:
+def likelihood_of(
+    scan: Scan,
+    views: np.ndarray,
+    *,
+    binning: int = 1,
+    air: Sequence[float] | np.ndarray | None = None,
+    model_error: float = 0.0,
+) -> Likelihood:
     """Build the likelihood of some views of a scan.
 
     Transmissions are treated as counts with an open beam of 1, scaled to photons. If the number of photons per value
@@ -123,6 +123,8 @@ def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Likelih
     Args:
         binning: number of rows and columns to combine, as in `ScanGeometry.binned`: photons are added, line
             integrals averaged.
+        air: (views,) factors on the open beam of counts; 1 if not given.
+        model_error: of counts, see `Poisson`.
 
     Returns:
         A likelihood with float32 tensors.
@@ -143,7 +145,9 @@ def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Likelih
     counts, beam, background = (
         _flat(_binned(np.where(good, part, 0) * np.float32(photons), binning)) for part in parts
     )
-    return Poisson(counts, beam, background)
+    if air is not None:
+        beam = beam * torch.as_tensor(air, dtype=torch.float32)[:, None]
+    return Poisson(counts, beam, background, model_error)
 
 
 def assumed_noise(scan: Scan, views: np.ndarray) -> float:

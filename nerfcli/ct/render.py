@@ -9,7 +9,7 @@ import torch
 from nerfcli.atomic import atomic_path
 from nerfcli.ct.evaluate import held_out_air
 from nerfcli.ct.grid import VoxelGrid
-from nerfcli.ct.likelihood import Likelihood, Poisson, likelihood_of
+from nerfcli.ct.likelihood import Likelihood, likelihood_of
 from nerfcli.ct.marks import MEANINGS, UNSEEN
 from nerfcli.ct.reconstruct import Projector
 from nerfcli.ct.result import Reconstruction, load_reconstruction, scan_of
@@ -73,11 +73,8 @@ def render_scan(
     geometry = corrected.select(chosen)
     projector, likelihood = Projector(geometry, result.grid), None
     if "residual" in outputs:
-        likelihood = likelihood_of(scan, chosen)
         air = held_out_air(scan, corrected, result) if views == "test" else result.used.get("air")
-        if air is not None:
-            assert isinstance(likelihood, Poisson)
-            likelihood = likelihood.scaled(torch.as_tensor(air, dtype=torch.float32))
+        likelihood = likelihood_of(scan, chosen, air=air)
     volume = torch.from_numpy(np.array(result.volume))
     top = float(np.nanmax(scan.line_integrals(chosen)))
     for number, view in enumerate(chosen):

@@ -255,12 +255,9 @@ def _estimates(
 
 def _problem(scan: Scan, geometry: ScanGeometry, grid: VoxelGrid, used: Mapping[str, Any], binning: int = 1) -> Problem:
     """Return the fit of the training views, binned, with the estimated model error and open beam."""
-    likelihood = likelihood_of(scan, scan.training_views, binning=binning)
-    if isinstance(likelihood, Poisson):
-        likelihood = likelihood.with_model_error(float(used.get("model_error", 0.0)))
-        if used.get("air") is not None:
-            likelihood = likelihood.scaled(torch.tensor(used["air"]))
-    return Problem(geometry.binned(binning).select(scan.training_views), likelihood, grid)
+    views, error = scan.training_views, float(used.get("model_error", 0.0))
+    likelihood = likelihood_of(scan, views, binning=binning, air=used.get("air"), model_error=error)
+    return Problem(geometry.binned(binning).select(views), likelihood, grid)
 
 
 def seconds_left(total: float | None, begun: float) -> float | None:
