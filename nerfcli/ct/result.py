@@ -6,7 +6,7 @@ RUN/marks.npy marks the voxels that the views do not determine, see `marks`.
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -99,13 +99,20 @@ class Reconstruction:
     scan_digest: str
     settings: ReconstructionSettings
     used: Mapping[str, Any] = field(default_factory=dict)
-    decisions: tuple[str, ...] = ()
+    decisions: Sequence[str] = ()
     passes: int = 0
     seconds: float = 0.0
     settled: bool = False
     missing_wedge_deg: float = 0.0
     versions: Mapping[str, str] = field(default_factory=dict)
     complete: bool = True
+
+
+# The fields of a reconstruction that its description holds as they are.
+_PLAIN = (
+    *("unit", "scan_digest", "used", "decisions", "passes", "seconds", "settled"),
+    *("missing_wedge_deg", "versions", "complete"),
+)
 
 
 def save_reconstruction(run: Path, result: Reconstruction) -> None:
@@ -116,6 +123,9 @@ def save_reconstruction(run: Path, result: Reconstruction) -> None:
     Raises:
         UserError: it cannot be written.
     """
+    plain = {name: getattr(result, name) for name in _PLAIN}
+    records = {"scan": str(result.scan), "grid": asdict(result.grid), "settings": asdict(result.settings)}
+    digests = {VOLUME: array_digest(result.volume), MARKS: array_digest(result.marks)}
     with (
         atomic_path(run / DESCRIPTION) as description,
         atomic_path(run / VOLUME) as volume,
@@ -123,26 +133,7 @@ def save_reconstruction(run: Path, result: Reconstruction) -> None:
     ):
         np.save(volume, result.volume, allow_pickle=False)
         np.save(marked, result.marks, allow_pickle=False)
-        write_sealed(
-            description,
-            {
-                "measurement": MEASUREMENT,
-                "scan": str(result.scan),
-                "scan_digest": result.scan_digest,
-                "unit": result.unit,
-                "grid": {"shape": list(result.grid.shape), "first": list(result.grid.first), "size": result.grid.size},
-                "settings": asdict(result.settings),
-                "used": dict(result.used),
-                "decisions": list(result.decisions),
-                "passes": result.passes,
-                "seconds": result.seconds,
-                "settled": result.settled,
-                "complete": result.complete,
-                "missing_wedge_deg": result.missing_wedge_deg,
-                "arrays": {VOLUME: array_digest(result.volume), MARKS: array_digest(result.marks)},
-                "versions": dict(result.versions),
-            },
-        )
+        write_sealed(description, {"measurement": MEASUREMENT, **plain, **records, "arrays": digests})
 
 
 def load_reconstruction(run: Path) -> Reconstruction:
@@ -157,23 +148,13 @@ def load_reconstruction(run: Path) -> Reconstruction:
     try:
         content = read_sealed(run / DESCRIPTION)
         arrays = {name: read_array(run / name, digest) for name, digest in content["arrays"].items()}
-        grid = content["grid"]
         return Reconstruction(
             arrays.pop(VOLUME),
             arrays.pop(MARKS),
-            VoxelGrid.of(grid["shape"], grid["first"], grid["size"]),
-            content["unit"],
-            Path(content["scan"]),
-            content["scan_digest"],
-            ReconstructionSettings(**content["settings"]),
-            content["used"],
-            tuple(content["decisions"]),
-            content["passes"],
-            content["seconds"],
-            content["settled"],
-            content["missing_wedge_deg"],
-            content["versions"],
-            content["complete"],
+            VoxelGrid.of(**content["grid"]),
+            scan=Path(content["scan"]),
+            settings=ReconstructionSettings(**content["settings"]),
+            **{name: content[name] for name in _PLAIN},
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
