@@ -249,15 +249,15 @@ def test_colours_are_those_of_the_field():
 # Files
 
 
-def ball_mesh() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def ball_mesh() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) + 0.25
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
     colours = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [128, 128, 128]], np.uint8)
-    return vertices, faces, mesh_of(vertices, faces).normals, colours
+    return vertices, faces, colours
 
 
 def test_a_ply_comes_back_and_says_what_it_is(tmp_path):
-    vertices, faces, _, _ = ball_mesh()
+    vertices, faces, _ = ball_mesh()
     source = "2 known distances (Hügel.txt), ± 0.3 %"
     described = {"format": "nerfcli geometry 1", "unit": "metre", "unit_source": source, "frame": "of the scene"}
     write_ply(tmp_path / "a.ply", dict(zip("xyz", vertices.T, strict=True)), faces=faces, description=described)
@@ -275,18 +275,11 @@ def test_a_ply_comes_back_and_says_what_it_is(tmp_path):
 
 @pytest.mark.parametrize("far", [0.0, 1e6])
 def test_a_glb_holds_the_frame_and_turns_it_in_its_root_node(far, tmp_path):
-    vertices, faces, normals, colours = ball_mesh()
+    vertices, faces, colours = ball_mesh()
     z_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     path = tmp_path / "a.glb"
-    write_glb(
-        path,
-        vertices + far,
-        faces,
-        normals=normals,
-        colours=colours,
-        y_up_from_frame=z_up,
-        description={"unit": "metre"},
-    )
+    mesh = mesh_of(vertices + far, faces)
+    write_glb(path, mesh, colours=colours, y_up_from_frame=z_up, description={"unit": "metre"})
     content = read_glb_json(path)
     assert content["asset"]["extras"] == {"unit": "metre"}
     data = path.read_bytes()

@@ -36,13 +36,11 @@ class Mesh:
         vertices: (V, 3) float64, the scene's frame and unit.
         faces: (F, 3) int64 vertex indices, anticlockwise as seen from outside.
         normals: (V, 3) unit, outwards; 0 if all faces of a vertex have zero area.
-        colours: (V, 3) uint8 sRGB, or None.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     normals: np.ndarray
-    colours: np.ndarray | None = None
 
 
 def surface_of(fused: FusedVolume, *, on_progress: Callable[[float], None] = lambda fraction: None) -> Mesh:
@@ -69,7 +67,7 @@ def surface_of(fused: FusedVolume, *, on_progress: Callable[[float], None] = lam
     return mesh_of(fused.grid.centres(places), triangles)
 
 
-def mesh_of(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None = None) -> Mesh:
+def mesh_of(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     """Return a mesh with normals, without degenerate triangles (two equal corners) and unused vertices."""
     proper = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     used, packed = np.unique(faces[proper], return_inverse=True)
@@ -82,7 +80,7 @@ def mesh_of(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None 
         np.add.at(normals, faces[:, corner], across)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
-    return Mesh(vertices, faces, normals, None if colours is None else colours[used])
+    return Mesh(vertices, faces, normals)
 
 
 def without_small_pieces(mesh: Mesh) -> Mesh:
@@ -96,7 +94,7 @@ def without_small_pieces(mesh: Mesh) -> Mesh:
     _, piece = connected_components(links, directed=False)
     of_faces = piece[first]
     large = np.bincount(of_faces, minlength=piece.max() + 1) >= _SMALLEST_PIECE * len(first)
-    return mesh_of(mesh.vertices, mesh.faces[large[of_faces]], mesh.colours)
+    return mesh_of(mesh.vertices, mesh.faces[large[of_faces]])
 
 
 def _any_block(index: np.ndarray) -> np.ndarray:
@@ -156,32 +154,26 @@ _BINARY = 0x004E4942
 _FAR = 1000.0
 
 
-def write_obj(
-    path: Path, vertices: np.ndarray, faces: np.ndarray, *, colours: np.ndarray, description: Mapping[str, Any]
-) -> None:
+def write_obj(path: Path, mesh: Mesh, *, colours: np.ndarray, description: Mapping[str, Any]) -> None:
     """Write a mesh as OBJ, atomically, with a colour after each position, which most programs can read.
 
     Args:
-        vertices: (N, 3).
-        faces: (F, 3).
-        colours: (N, 3) uint8 sRGB.
+        colours: (V, 3) uint8 sRGB.
 
     Raises:
         UserError: the file cannot be written.
     """
-    rows = np.concatenate([vertices, colours / 255.0], axis=1)
+    rows = np.concatenate([mesh.vertices, colours / 255.0], axis=1)
     with atomic_path(path) as partial, partial.open("w", encoding="utf-8") as file:
         file.writelines(f"# {line}\n" for line in comments_of(description))
         file.writelines("v %.9g %.9g %.9g %.4f %.4f %.4f\n" % tuple(row) for row in rows.tolist())  # noqa: UP031 - faster
-        file.writelines("f %d %d %d\n" % tuple(row) for row in (faces + 1).tolist())  # noqa: UP031 - faster
+        file.writelines("f %d %d %d\n" % tuple(row) for row in (mesh.faces + 1).tolist())  # noqa: UP031 - faster
 
 
 def write_glb(
     path: Path,
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: Mesh,
     *,
-    normals: np.ndarray,
     colours: np.ndarray,
     y_up_from_frame: np.ndarray,
     description: Mapping[str, Any],
@@ -192,15 +184,13 @@ def write_glb(
     glTF requires, and the material is unlit because the colours already contain the scene's lighting.
 
     Args:
-        vertices: (N, 3).
-        faces: (F, 3).
-        normals: (N, 3) unit.
-        colours: (N, 3) uint8 sRGB.
+        colours: (V, 3) uint8 sRGB.
         y_up_from_frame: (3, 3) rotation.
 
     Raises:
         UserError: the file cannot be written.
     """
+    vertices = mesh.vertices
     middle = vertices.mean(axis=0) if len(vertices) else np.zeros(3)
     size = np.abs(vertices - middle).max(initial=0.0)
     if np.abs(middle).max() < _FAR * size:
@@ -208,7 +198,7 @@ def write_glb(
     positions = (vertices - middle).astype("<f4")
     light = np.full((len(vertices), 4), 65535, "<u2")
     light[:, :3] = np.rint(65535 * linear_light(colours / 255.0))
-    parts = [positions.tobytes(), normals.astype("<f4").tobytes(), light.tobytes(), faces.astype("<u4").tobytes()]
+    parts = [each.tobytes() for each in (positions, mesh.normals.astype("<f4"), light, mesh.faces.astype("<u4"))]
     starts = np.cumsum([0, *(len(part) for part in parts)])
     turn = np.eye(4)
     turn[:3, :3] = y_up_from_frame
@@ -241,7 +231,7 @@ def write_glb(
             },
             {"bufferView": 1, "componentType": _FLOAT, "type": "VEC3", "count": len(vertices)},
             {"bufferView": 2, "componentType": _USHORT, "normalized": True, "type": "VEC4", "count": len(vertices)},
-            {"bufferView": 3, "componentType": _UINT, "type": "SCALAR", "count": 3 * len(faces)},
+            {"bufferView": 3, "componentType": _UINT, "type": "SCALAR", "count": 3 * len(mesh.faces)},
         ],
     }
     text = json.dumps(content, ensure_ascii=True, allow_nan=False).encode()

@@ -1,6 +1,5 @@
 """Export a run to files that other programs open: a page, a mesh, points, splats."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from nerfcli.errors import UserError
 from nerfcli.export.depth_views import DepthView, depth_views, spread_frames, surface_colours
 from nerfcli.export.extent import MOST_VIEWS, Grid, SurfaceSettings, automatic_voxel, check_box, scene_box
 from nerfcli.export.fusion import agreed_points, fuse
-from nerfcli.export.meshes import Mesh, simplified, surface_of, without_small_pieces, write_glb, write_obj
+from nerfcli.export.meshes import simplified, surface_of, without_small_pieces, write_glb, write_obj
 from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
 from nerfcli.output import Output
@@ -144,16 +143,20 @@ def _export_mesh(run: Run, model: Model, path: Path, *, settings: SurfaceSetting
     mesh = simplified(mesh, settings.faces, threads=torch.get_num_threads())
     reporter.progress(0.97, "colours")
     colours = surface_colours(model, mesh.vertices, mesh.normals, voxel_size=grid.voxel_size)
-    description = _description(run, model, "mesh", grid) | {
+    described = _description(run, model, "mesh", grid) | {
         "faces_before_simplification": found,
         "made_by": "truncated signed distances of median depths, marching cubes",
     }
-    seen: dict[str, np.ndarray] = {}
-    if path.suffix.lower() == ".ply":
-        photos, parallax = coverage_and_parallax([view.distances() for view in views], mesh.vertices)
-        seen = {"photos": photos.astype(np.uint16), "parallax_deg": parallax}
-        description |= {"parallax_deg": PARALLAX}
-    _write_mesh(path, mesh, colours, description, seen=seen, y_up=y_up_from_scene(run))
+    match path.suffix.lower():
+        case ".glb":
+            write_glb(path, mesh, colours=colours, y_up_from_frame=y_up_from_scene(run), description=described)
+        case ".obj":
+            write_obj(path, mesh, colours=colours, description=described)
+        case _:
+            photos, parallax = coverage_and_parallax([view.distances() for view in views], mesh.vertices)
+            columns = _columns(mesh.vertices, mesh.normals.astype("<f4"), colours)
+            columns |= {"photos": photos.astype(np.uint16), "parallax_deg": parallax}
+            write_ply(path, columns, faces=mesh.faces, description=described | {"parallax_deg": PARALLAX})
     of_found = f" of {found}" if found != len(mesh.faces) else ""
     reporter.note(f"{len(mesh.faces)} triangles{of_found}, {_grid_in_words(grid, model)}")
 
@@ -164,9 +167,7 @@ def _export_points(run: Run, model: Model, path: Path, *, settings: SurfaceSetti
     points = agreed_points(views, grid, on_progress=reporter.part(_DEPTHS, 1.0, "comparing views"))
     if not len(points.places):
         raise UserError("no two photos see the same point in the box", "use another --box, or train longer")
-    columns = dict(zip("xyz", points.places.T, strict=True))
-    columns |= dict(zip(("nx", "ny", "nz"), points.normals.T, strict=True))
-    columns |= dict(zip(("red", "green", "blue"), points.colours.T, strict=True))
+    columns = _columns(points.places, points.normals, points.colours)
     columns |= {"photos": points.photos, "parallax_deg": points.parallax_deg, "spread": points.spread}
     described = _description(run, model, "points", grid) | {
         "parallax_deg": PARALLAX,
@@ -207,30 +208,7 @@ def _unit_of(model: Model) -> str:
     return "m" if model.unit == "metre" else "units of the scene"
 
 
-def _write_mesh(
-    path: Path,
-    mesh: Mesh,
-    colours: np.ndarray,
-    description: Mapping[str, Any],
-    *,
-    seen: Mapping[str, np.ndarray],
-    y_up: np.ndarray,
-) -> None:
-    match path.suffix.lower():
-        case ".glb":
-            write_glb(
-                path,
-                mesh.vertices,
-                mesh.faces,
-                normals=mesh.normals,
-                colours=colours,
-                y_up_from_frame=y_up,
-                description=description,
-            )
-        case ".obj":
-            write_obj(path, mesh.vertices, mesh.faces, colours=colours, description=description)
-        case _:
-            columns = dict(zip("xyz", mesh.vertices.T, strict=True))
-            columns |= dict(zip(("nx", "ny", "nz"), mesh.normals.astype("<f4").T, strict=True))
-            columns |= dict(zip(("red", "green", "blue"), colours.T, strict=True))
-            write_ply(path, {**columns, **seen}, faces=mesh.faces, description=description)
+def _columns(places: np.ndarray, normals: np.ndarray, colours: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the columns of a .ply that most programs read, from (N, 3) each."""
+    names = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue")
+    return dict(zip(names, (*places.T, *normals.T, *colours.T), strict=True))
