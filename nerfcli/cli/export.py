@@ -1,6 +1,5 @@
 """nerfcli export: export a run as a page, a mesh, points or splats."""
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -38,13 +37,17 @@ class SurfaceOptions:
 
         Raises:
             typer.BadParameter: a value cannot be parsed, or is no size.
+            UserError: the box is none.
         """
         from nerfcli.export.extent import FACES, SurfaceSettings
 
         finite(self.voxel_size, "--voxel-size")
         if self.voxel_size is not None and self.voxel_size <= 0:
             raise typer.BadParameter(f"{self.voxel_size:g} is not a positive size", param_hint="--voxel-size")
-        box = None if self.box is None else box_of(self.box)
+        try:
+            box = None if self.box is None else tuple(map(float, self.box.split(",")))
+        except ValueError as error:
+            raise typer.BadParameter(f"{self.box!r}; write X0,Y0,Z0,X1,Y1,Z1", param_hint="--box") from error
         return SurfaceSettings(box, self.voxel_size, faces=self.faces or FACES)
 
 
@@ -171,20 +174,3 @@ def _refuse_unused(to: str, surface: SurfaceOptions, splats: SplatOptions) -> No
     for name, value in vars(splats).items():
         unused[f"--{name}"] = (to != "splats" and value is not None and value is not False, "splats")
     refuse_unused(unused, "it is for {}; remove it")
-
-
-def box_of(text: str) -> tuple[float, ...]:
-    """Parse --box: six comma-separated numbers.
-
-    Raises:
-        typer.BadParameter: anything else, or a low corner that is not below the high one.
-    """
-    try:
-        box = tuple(float(value) for value in text.split(","))
-    except ValueError:
-        box = ()
-    if len(box) != 6 or not all(math.isfinite(value) for value in box):
-        raise typer.BadParameter(f"{text!r}; write X0,Y0,Z0,X1,Y1,Z1", param_hint="--box")
-    if not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
-        raise typer.BadParameter(f"{text!r}; the low corner comes first", param_hint="--box")
-    return box

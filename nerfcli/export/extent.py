@@ -26,12 +26,24 @@ class SurfaceSettings:
         voxel_size: scene units; None for the resolution of the photos.
         faces: most triangles.
         max_size: longer side of the pictures whose depths are fused, pixels.
+
+    Raises:
+        UserError: the box is not six finite numbers with the low corner first.
     """
 
     box: tuple[float, ...] | None = None
     voxel_size: float | None = None
     faces: int = FACES
     max_size: int = MAX_SIZE
+
+    def __post_init__(self) -> None:
+        box = self.box
+        if box is not None and not (len(box) == 6 and np.isfinite(box).all() and np.less(box[:3], box[3:]).all()):
+            raise UserError(
+                f"invalid --box {','.join(f'{value:g}' for value in box)}",
+                "expected X0,Y0,Z0,X1,Y1,Z1 in the scene's units, the low corner first",
+                exit_code=2,
+            )
 
 
 # Most voxels along a side; beyond, not even the index of the blocks fits into memory.
@@ -81,22 +93,6 @@ class Grid:
     def high(self) -> np.ndarray:
         """The corner (3,) opposite to `low`."""
         return self.low + self.voxel_size * np.array(self.shape)
-
-
-def check_box(box: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the box after checking that its low corner is below its high corner.
-
-    Raises:
-        UserError: the corners are not in order, or a number is not finite.
-    """
-    values = np.array(box, dtype=np.float64)
-    if values.shape != (6,) or not np.isfinite(values).all() or not (values[:3] < values[3:]).all():
-        raise UserError(
-            f"invalid --box {','.join(f'{value:g}' for value in box)}",
-            "expected X0,Y0,Z0,X1,Y1,Z1 in the scene's units, the low corner first",
-            exit_code=2,
-        )
-    return tuple(values.tolist())
 
 
 def scene_box(model: Model, frames: Sequence[Frame]) -> tuple[float, ...]:

@@ -8,7 +8,7 @@ import torch
 
 from nerfcli.errors import UserError
 from nerfcli.export.depth_views import DepthView, depth_views, spread_frames, surface_colours
-from nerfcli.export.extent import MOST_VIEWS, Grid, SurfaceSettings, automatic_voxel, check_box, scene_box
+from nerfcli.export.extent import MOST_VIEWS, Grid, SurfaceSettings, automatic_voxel, scene_box
 from nerfcli.export.fusion import agreed_points, fuse
 from nerfcli.export.meshes import simplified, surface_of, without_small_pieces, write_glb, write_obj
 from nerfcli.machine import Resources
@@ -75,8 +75,6 @@ def export_run(
     suffixes = TARGETS[to]
     if path.suffix.lower() not in suffixes:
         raise UserError(f"{path} does not have the suffix of a {to}", f"use one of {', '.join(suffixes)}", exit_code=2)
-    if settings.box is not None:
-        check_box(settings.box)
     _ = trained.config
     output.claim_file(path)
     resources.begin()
