@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 Beam = Literal["cone", "parallel"]
+BEAMS: tuple[Beam, ...] = ("cone", "parallel")
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput
 from nerfcli.ct.formats.pictures import read_npy
 from nerfcli.ct.formats.statement import Statement, angles_in_radians, read_object
-from nerfcli.ct.geometry import Circle
+from nerfcli.ct.geometry import BEAMS, Circle
 from nerfcli.ct.recognise import R2_GAUSSIAN
 from nerfcli.ct.truth import described_truth
 from nerfcli.errors import UserError
@@ -24,7 +24,7 @@ def read_r2_gaussian(path: Path) -> ReaderOutput:
     """Read a folder with a meta_data.json, or the meta_data.json itself; proj_test is held out."""
     file = path / R2_GAUSSIAN if path.is_dir() else path
     meta = read_object(file, hint=_HINT)
-    scanner = Statement(file, _mapping(meta.value("scanner"), "scanner", file), hint=_HINT)
+    scanner = meta.nested("scanner")
     frames = [
         (part, frame) for part in ("proj_train", "proj_test") for frame in _list(meta.value(part, []), part, file)
     ]
@@ -40,9 +40,7 @@ def read_r2_gaussian(path: Path) -> ReaderOutput:
     angles = angles_in_radians(
         np.array([_angle(frame) for _, frame in frames]), views=len(frames), unit="rad", where=f"{file}: angle"
     )
-    mode = scanner.text("mode")
-    if mode not in ("cone", "parallel"):
-        raise UserError(f"{file}: mode is {mode!r}", "write cone or parallel: no other beams are supported")
+    beam = scanner.one_of("mode", BEAMS)
     count = _pair(scanner, "nDetector")
     if "dDetector" in scanner:
         height, width = _pair(scanner, "dDetector")
@@ -57,9 +55,9 @@ def read_r2_gaussian(path: Path) -> ReaderOutput:
     if not (width > 0 and height > 0):
         raise UserError(f"{file}: pixels of {width:g} x {height:g}", "give sizes above 0 in sDetector or dDetector")
     right, up = _pair(scanner, "offDetector", (0.0, 0.0))
-    cone = mode == "cone"
+    cone = beam == "cone"
     circle = Circle(
-        "cone" if cone else "parallel",
+        beam,
         tuple(angles.tolist()),
         *(width, height, rows, columns),
         scanner.positive("DSO") if cone else 0.0,
@@ -110,12 +108,6 @@ def _truth(meta: Statement, scanner: Statement, file: Path) -> dict[str, Any]:
 def _angle(frame: dict[str, Any]) -> float:
     value = frame.get("angle")
     return float(value) if isinstance(value, int | float) else float("nan")
-
-
-def _mapping(value: Any, name: str, file: Path) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise UserError(f"{file} has no {name}", _HINT)
-    return value
 
 
 def _list(value: Any, name: str, file: Path) -> list[dict[str, Any]]:

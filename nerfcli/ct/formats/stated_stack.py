@@ -33,10 +33,10 @@ import numpy as np
 from nerfcli.ct.formats.assemble import ReaderOutput
 from nerfcli.ct.formats.pictures import SUFFIXES, numbered, read_npy, read_stack
 from nerfcli.ct.formats.statement import Statement, angles_in_radians, millimetres, read_object
-from nerfcli.ct.geometry import Beam, Circle, ScanGeometry, from_vectors
+from nerfcli.ct.geometry import BEAMS, Beam, Circle, ScanGeometry, from_vectors
 from nerfcli.ct.open_beam import OpenBeam, check_sizes, open_beam_of
 from nerfcli.ct.recognise import STACK
-from nerfcli.ct.scan import KINDS, Kind
+from nerfcli.ct.scan import KINDS
 from nerfcli.ct.truth import described_truth
 from nerfcli.errors import UserError
 
@@ -55,22 +55,18 @@ def read_stated_stack(path: Path) -> ReaderOutput:
     unknown = [name for name in fields.names if name not in _KEYS]
     if unknown:
         raise UserError(f"{file}: {unknown[0]!r} is not a key of scan.json", f"the keys are {', '.join(_KEYS)}")
-    kind = _one_of(fields, "kind", KINDS)
-    beam_kind: Beam = "cone" if _one_of(fields, "beam", ("cone", "parallel")) == "cone" else "parallel"
+    kind, beam = fields.one_of("kind", KINDS), fields.one_of("beam", BEAMS)
     values = _pictures(file, fields.text("projections"), "projections")
     views, rows, columns = values.shape
     factor = millimetres(fields.text("unit"), where=f"{file}: unit")
     if "vectors" in fields:
-        geometry: Circle | ScanGeometry = _vectors(fields, beam_kind, factor, rows=rows, columns=columns)
+        geometry: Circle | ScanGeometry = _vectors(fields, beam, factor, rows=rows, columns=columns)
     else:
-        geometry = _circle(fields, beam_kind, views=views, rows=rows, columns=columns).scaled(factor)
-    measured: Kind = next(name for name in KINDS if name == kind)
-    beam = _open_beam(file, fields, values.shape) if measured == "counts" else None
-    photons = fields.positive("photons") if "photons" in fields else None
+        geometry = _circle(fields, beam, views=views, rows=rows, columns=columns).scaled(factor)
     return ReaderOutput(
-        *(path, "stack", values, measured, geometry, "mm"),
-        beam=beam,
-        photons=photons,
+        *(path, "stack", values, kind, geometry, "mm"),
+        beam=_open_beam(file, fields, values.shape) if kind == "counts" else None,
+        photons=fields.positive("photons") if "photons" in fields else None,
         held_out=_held_out(fields, views),
         history=_truth(fields, factor),
         stated_mm=factor,
@@ -84,7 +80,7 @@ def _circle(fields: Statement, beam: Beam, *, views: int, rows: int, columns: in
     if stated is None:
         raise UserError(f"{where} has no angles_deg", _HINT)
     if isinstance(stated, dict):
-        steps = Statement(fields.path, stated, hint="angles are a list, or an object with first and step")
+        steps = fields.nested(name, hint="angles are a list, or an object with first and step")
         stated = steps.number("first", 0.0) + steps.number("step") * np.arange(views)
     try:
         numbers = np.asarray(stated, dtype=np.float64).reshape(-1)
@@ -168,12 +164,7 @@ def _truth(fields: Statement, factor: float) -> dict[str, Any]:
     """Describe the true volume, centred on the origin; its stated attenuation is in the inverse of the stated unit."""
     if "truth" not in fields:
         return {}
-    given = fields.value("truth")
-    if not isinstance(given, dict):
-        raise UserError(
-            f"{fields.path}: truth is {given!r}", "give an object with volume, voxel_size, attenuation_per_value"
-        )
-    stated = Statement(fields.path, given, hint="truth has volume, voxel_size and attenuation_per_value")
+    stated = fields.nested("truth", hint="truth has volume, voxel_size and attenuation_per_value")
     path = fields.path.parent / stated.text("volume")
     try:
         shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
@@ -186,10 +177,3 @@ def _truth(fields: Statement, factor: float) -> dict[str, Any]:
     size = stated.positive("voxel_size") * factor
     value = stated.positive("attenuation_per_value") / factor
     return described_truth(path, "zyx", shape, size=size, attenuation_per_value=value)
-
-
-def _one_of(fields: Statement, name: str, choices: tuple[str, ...]) -> str:
-    text = fields.text(name)
-    if text not in choices:
-        raise UserError(f"{fields.path}: {name} is {text!r}", f"choose one of {', '.join(choices)}")
-    return text

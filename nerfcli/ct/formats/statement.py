@@ -2,14 +2,16 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from nerfcli.errors import UserError
+
+Word = TypeVar("Word", bound=str)
 
 # Millimetres per unit of length, keyed by the names of units in files.
 MILLIMETRES = {
@@ -155,6 +157,23 @@ class Statement:
         if value != round(value):
             raise UserError(f"{self.path}: {name} is {value:g}", "expected a whole number")
         return round(value)
+
+    def one_of(self, name: str, choices: Sequence[Word]) -> Word:
+        """Return a field that is one of several words."""
+        text = self.text(name)
+        for choice in choices:
+            if choice == text:
+                return choice
+        raise UserError(f"{self.path}: {name} is {text!r}", f"choose one of {', '.join(choices)}")
+
+    def nested(self, name: str, *, hint: str | None = None) -> "Statement":
+        """Return the fields of a field that is an object; `hint` is for errors in them."""
+        value, hint = self._fields.get(name.lower()), hint or self.hint
+        if value is None:
+            raise UserError(f"{self.path} has no {name}", hint)
+        if not isinstance(value, dict):
+            raise UserError(f"{self.path}: {name} is {value!r}", hint)
+        return Statement(self.path, value, hint=hint)
 
     def value(self, name: str, default: Any = None) -> Any:
         """Return a field without conversion."""

@@ -16,6 +16,7 @@ from nerfcli.ct.formats.pictures import read_npy, read_stack
 from nerfcli.ct.formats.statement import Statement, read_object
 from nerfcli.ct.geometry import ScanGeometry, circle_of
 from nerfcli.ct.recognise import TRANSFORMS, TRANSFORMS_GEOMETRY
+from nerfcli.ct.scan import Kind
 from nerfcli.ct.truth import described_truth
 from nerfcli.errors import UserError
 
@@ -56,7 +57,7 @@ def read_transmission_transforms(path: Path) -> ReaderOutput:
     circle, apart = circle_of(geometry)
     return ReaderOutput(
         *(path, "transmission-transforms", values),
-        kind="line_integral" if kind == "line_integral" else "transmission",
+        kind=kind,
         geometry=circle if apart < 1e-6 else geometry,
         unit="voxel" if stated.number("voxel_size", 0.0) == 1 else UNKNOWN_UNIT,
         photons=photons,
@@ -97,12 +98,12 @@ def _frames(folder: Path) -> tuple[list[dict[str, Any]], Statement]:
     return sorted(frames, key=lambda frame: str(frame["file_path"])), lens
 
 
-def _values(path: Path, folder: Path, frames: list[dict[str, Any]]) -> tuple[np.ndarray, str, float | None]:
+def _values(path: Path, folder: Path, frames: list[dict[str, Any]]) -> tuple[np.ndarray, Kind, float | None]:
     """Return the values, their kind, and the photons that the name of a .npy states."""
     if path.suffix == ".npy":
         values = read_npy(path, hint="it is damaged: export it again")
         photons = re.search(r"I0_(\d+)", path.stem)
-        kind = "line_integral" if "line_integral" in path.stem else "transmission"
+        kind: Kind = "line_integral" if "line_integral" in path.stem else "transmission"
         return values, kind, float(photons[1]) if photons and kind == "transmission" else None
     return read_stack([folder / str(frame["file_path"]) for frame in frames]) / WHITE, "transmission", None
 
