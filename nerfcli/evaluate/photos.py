@@ -31,21 +31,15 @@ from nerfcli.training.runs.run import Run
 
 
 @dataclass(frozen=True)
-class HeldOutPhoto:
+class HeldOutPhoto(LoadedPhoto):
     """A held-out photo at the resolution of the training.
 
     Args:
-        frame: its camera and pose.
-        pixels: (H, W, 3 or 4) uint8 sRGB, straight alpha.
-        used: (H, W) bool; None for all pixels.
         log_gains: logarithms of its gains relative to rendered pictures, from EXIF or from the training photos
             around it, never from the photo itself; see `field.exposure`.
         gains_from: the source of the gains, one of `held_out_exposure.SOURCES`.
     """
 
-    frame: Frame
-    pixels: np.ndarray
-    used: np.ndarray | None
     log_gains: tuple[float, ...] = (0.0, 0.0, 0.0)
     gains_from: str = "none"
 

@@ -1,6 +1,5 @@
 """Descriptions of scans: the user's options, units, and fields of text files, as "key = value" lines or JSON."""
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,6 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from nerfcli.atomic import read_json
 from nerfcli.errors import UserError
 
 Word = TypeVar("Word", bound=str)
@@ -204,12 +204,4 @@ def read_object(path: Path, *, hint: str) -> Statement:
     Raises:
         UserError: it cannot be read, or is not a JSON object.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}", hint) from error
-    except ValueError as error:
-        raise UserError(f"{path} is not JSON: {error}", hint) from error
-    if not isinstance(content, dict):
-        raise UserError(f"{path} holds a {type(content).__name__}", hint)
-    return Statement(path, content, hint=hint)
+    return Statement(path, read_json(path, needed=(), hint=hint), hint=hint)

@@ -1,13 +1,14 @@
 """Facts read from the folders of a run and its scene: settings, log, metrics, poses, warnings."""
 
-import json
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from nerfcli.atomic import read_json
 from nerfcli.captures.formats.run_cameras import RunCameras
-from nerfcli.errors import UserError, listed, several
+from nerfcli.errors import listed, several
 from nerfcli.evaluate.protocol import RunMetrics
 from nerfcli.training.runs.files import LogEntry
 from nerfcli.training.runs.run import Run, RunConfig
@@ -142,12 +143,6 @@ def _of_poses(poses: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 def _json(path: Path) -> dict[str, Any] | None:
     """Return the JSON object in a file; None if the file does not exist."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
+    if not os.path.exists(path):
         return None
-    except (OSError, ValueError) as error:
-        raise UserError(f"cannot read {path}: {error}", "write it again with the command that created it") from error
-    if not isinstance(content, dict):
-        raise UserError(f"{path} is not a JSON object", "write it again with the command that created it")
-    return content
+    return read_json(path, needed=(), hint="write it again with the command that created it")
