@@ -114,7 +114,6 @@ def show_evaluation(evaluation: "Evaluation", console: Console, *, field: "RunMe
 
 
 def _print_numbers(run: Path, metrics: "RunMetrics", console: Console) -> None:
-    """Print the metrics of a run in a few lines and a table."""
     from nerfcli.evaluate.ledger import summary_line
 
     assert metrics.training is not None

@@ -289,7 +289,6 @@ def _read_tiff(path: Path) -> VolumeFile:
 
 
 def _units(volume: VolumeFile) -> str:
-    """Return the comment that states both units."""
     return f"unit {volume.unit or '-'} quantity {volume.quantity or '-'}"
 
 

@@ -123,11 +123,7 @@ def _of_file(path: Path) -> str | None:
 
 
 def _hdf5_form(path: Path) -> str | None:
-    """Return "data-exchange", "nxtomo", or None for other HDF5 files.
-
-    Raises:
-        UserError: the file cannot be opened as HDF5.
-    """
+    """Return "data-exchange", "nxtomo", or None for other HDF5 files."""
     with open_hdf5(path) as file:
         if "exchange/data" in file or "exchange" in file:
             return "data-exchange"

@@ -128,11 +128,7 @@ def _holds_something(run: Path) -> bool:
 def _reason_to_keep(
     run: Path, earlier: Reconstruction, scan_digest: str, settings: ReconstructionSettings, *, resume: bool
 ) -> str:
-    """Return why an earlier reconstruction is kept as it is; "" if it is to be continued.
-
-    Raises:
-        UserError: it is another reconstruction, or an interrupted one and `resume` is not set.
-    """
+    """Return why an earlier reconstruction is kept as it is; "" if it is to be continued."""
     made, given = asdict(earlier.settings), asdict(settings)
     changed = [] if earlier.scan_digest == scan_digest else ["the scan"]
     changed += [

@@ -139,7 +139,6 @@ def _legend(lines: tuple[str, ...], suffix: str, colours: ColourRange, *, width:
 
 
 def _lines(meta: DepthMeta, colours: ColourRange) -> tuple[str, ...]:
-    """Return the lines of the legend that describe the values."""
     by_inverse = "colours by 1 / depth; " if colours.inverse else ""
     unit = {"arbitrary": "arbitrary units", "metre": "metres"}.get(meta.unit, meta.unit)
     if meta.quantity in UNIT_OF:
@@ -250,7 +249,6 @@ def value_range(maps: Callable[[], Iterable[np.ndarray]], output: str) -> Colour
 
 
 def _comment(job: RenderJob, meta: DepthMeta, output: str, ranges: dict[str, ColourRange]) -> dict[str, Any]:
-    """Return the description of a video for its container's comment."""
     description: dict[str, Any] = {"nerfcli": __version__, "outputs": [output], **job.provenance}
     if output in MEASURED:
         description |= meaning_of(meta, job.settings.depth, output).to_json()

@@ -94,7 +94,6 @@ def scene_of(
 
 
 def _html(scene: dict[str, Any], numbers: str) -> str:
-    """Assemble the HTML page around a scene description."""
     shaders = "".join(
         f'<script type="x-shader/x-fragment" id="{part}">{_text(f"{part}.glsl")}</script>' for part in ("trace", "show")
     )

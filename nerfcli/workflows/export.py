@@ -96,7 +96,6 @@ def default_target(run: Path, to: str, suffix: str | None = None) -> Path:
 
 
 def _export_page(run: Run, model: Model, path: Path, *, settings: SurfaceSettings, reporter: Reporter) -> None:
-    """Write the run as a page."""
     packed = pack_model(model)
     cameras = run.cameras
     frames = [pinhole_frame(frame) for frame in (*cameras.train, *cameras.test)]
@@ -131,7 +130,6 @@ _DEPTHS = 0.7
 
 
 def _export_mesh(run: Run, model: Model, path: Path, *, settings: SurfaceSettings, reporter: Reporter) -> None:
-    """Write the surface as .ply, .glb or .obj."""
     views, grid = _seen(run, model, settings, reporter)
     fused = fuse(views, grid, on_progress=reporter.part(_DEPTHS, 0.9, "fusing depths"))
     mesh = without_small_pieces(surface_of(fused, on_progress=reporter.part(0.9, 0.95, "extracting the surface")))
@@ -160,7 +158,6 @@ def _export_mesh(run: Run, model: Model, path: Path, *, settings: SurfaceSetting
 
 
 def _export_points(run: Run, model: Model, path: Path, *, settings: SurfaceSettings, reporter: Reporter) -> None:
-    """Write points of the surfaces as .ply."""
     views, grid = _seen(run, model, settings, reporter)
     points = agreed_points(views, grid, on_progress=reporter.part(_DEPTHS, 1.0, "comparing views"))
     if not len(points.places):
@@ -186,7 +183,6 @@ def _seen(run: Run, model: Model, settings: SurfaceSettings, reporter: Reporter)
 
 
 def _description(run: Run, model: Model, kind: str, grid: Grid) -> dict[str, Any]:
-    """Return the description that an exported file contains."""
     return {
         "format": FORMAT,
         "holds": kind,
@@ -202,7 +198,6 @@ def _grid_in_words(grid: Grid, model: Model) -> str:
 
 
 def _unit_of(model: Model) -> str:
-    """Return the unit of lengths, for messages."""
     return "m" if model.unit == "metre" else "units of the scene"
 
 

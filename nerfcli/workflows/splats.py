@@ -206,11 +206,7 @@ def run_splats(run: Run, model: Model, *, settings: SplatSettings, reporter: Rep
 
 
 def _kept(run: Run, model: Model, settings: SplatSettings) -> RunSplats | None:
-    """Return the splats that the run has, if they are to be used or refined further.
-
-    Raises:
-        UserError: there is nothing to resume.
-    """
+    """Return the splats that the run has, if they are to be used or refined further."""
     path = run.path / SPLATS
     splats = load_splat_state(path) if path.exists() else None
     same = (
@@ -254,7 +250,6 @@ def _started(
     settings: SplatSettings,
     reporter: Reporter,
 ) -> RunSplats:
-    """Return the first splats of a field."""
     core_seconds = settings.budget_seconds * torch.get_num_threads()
     count = settings.count or count_for(loaded, core_seconds=core_seconds)
     start = gaussians_of_field(
