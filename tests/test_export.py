@@ -52,26 +52,13 @@ def model() -> Model:
     return replace(foggy, unit_source="gps")
 
 
-def order(frames: list[Frame], *, outputs: tuple[str, ...] = ("rgb", "depth", "opacity"), **settings: Any) -> RenderJob:
-    wanted: dict[str, Any] = {"depth": DEPTH} | settings
-    return RenderJob(tuple(frames), RenderSettings(outputs=outputs, **wanted), {"run": "a run"})
-
-
-def export(model: Model, frames: list[Frame], folder: Path, **settings: Any) -> list[Path]:
-    ordered = order(frames, **settings)
-    return render_job(model, ordered, Output(folder))
-
-
-def ordered(frames: list[Frame], **settings: Any) -> RenderJob:
-    wanted: dict[str, Any] = {"outputs": OUTPUTS, "depth": DEPTH} | settings
-    return RenderJob(tuple(frames), RenderSettings(**wanted), {"run": "a run", "field_sha256": "ab"})
-
-
-def noted(model: Model, order: RenderJob, folder: Path) -> list[str]:
-    """Render and return the notes."""
-    notes: list[str] = []
-    render_job(model, order, Output(folder), reporter=Reporter(note=notes.append))
-    return notes
+def export(
+    model: Model, frames: list[Frame], folder: Path, *, notes: list[str] | None = None, **settings: Any
+) -> list[Path]:
+    """Render, and return the paths that are shown; `notes` gets the notes."""
+    wanted: dict[str, Any] = {"outputs": ("rgb", "depth", "opacity"), "depth": DEPTH} | settings
+    job = RenderJob(tuple(frames), RenderSettings(**wanted), {"run": "a run", "field_sha256": "ab"})
+    return render_job(model, job, Output(folder), reporter=Reporter(note=([] if notes is None else notes).append))
 
 
 def pictured(model: Model, name: str = "a", distance: float = 2.0) -> RenderedPicture:
@@ -145,24 +132,21 @@ def test_each_convention_states_its_own_floor_and_background(convention, floor, 
     assert meta.background_distance == (9.0 if convention == "background" else None)
 
 
-def test_names_keep_folders_and_stay_apart():
-    names = ["left/a.png", "right/a.png", "b.jpg", "b.png", "c.2.jpg", "Küche 1.JPG", "view_0001"]
-    expected = ["left/a", "right/a", "b.jpg", "b.png", "c.2", "Küche 1", "view_0001"]
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (
+            ["left/a.png", "right/a.png", "b.jpg", "b.png", "c.2.jpg", "Küche 1.JPG", "view_0001"],
+            ["left/a", "right/a", "b.jpg", "b.png", "c.2", "Küche 1", "view_0001"],
+        ),
+        # The whole name of the first is the stem of others.
+        (["b", "b.png", "b.jpg", "b.png.jpg"], ["b", "b.png", "b.jpg", "b.png.jpg"]),
+        (["../images/a.png", "a.png", "../b.png"], ["up/images/a", "a", "up/b"]),
+    ],
+    ids=["folders", "stems that are names", "outside"],
+)
+def test_names_keep_folders_and_stay_apart_and_inside(names, expected):
     assert file_names([frame(name) for name in names]) == expected
-
-
-def test_a_stem_that_is_another_frames_full_name_stays_apart():
-    # "b" and "b.png" and "b.jpg": the whole name of the first is the stem of the others.
-    names = file_names([frame(name) for name in ("b", "b.png", "b.jpg", "b.png.jpg")])
-    assert len(set(names)) == 4
-
-
-def test_names_stay_inside_the_folder():
-    assert file_names([frame(name) for name in ("../images/a.png", "a.png", "../b.png")]) == [
-        "up/images/a",
-        "a",
-        "up/b",
-    ]
 
 
 def test_frames_in_subfolders_with_equal_names(model, tmp_path):
@@ -229,7 +213,7 @@ def test_every_file_states_the_error_of_its_rendering(views):
 
 
 def test_every_format_holds_the_maps_of_the_picture(model, tmp_path):
-    noted(model, ordered([frame("a.png")], formats=("tiff", "exr", "npy")), tmp_path / "views")
+    export(model, [frame("a.png")], tmp_path / "views", outputs=OUTPUTS, formats=("tiff", "exr", "npy"))
     picture = pictured(model)
     with OpenEXR.File(str(tmp_path / "views/exr/a.exr"), separate_channels=True) as file:
         channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
@@ -247,7 +231,7 @@ def test_every_format_holds_the_maps_of_the_picture(model, tmp_path):
 
 @pytest.mark.parametrize("file_format", ["tiff", "exr", "npy", "png16"])
 def test_every_file_says_what_it_is_and_who_saw_it(file_format, model, tmp_path):
-    noted(model, ordered([frame("a.png")], formats=(file_format,)), tmp_path / "views")
+    export(model, [frame("a.png")], tmp_path / "views", formats=(file_format,))
     meta = depth_meta_of(map_path(tmp_path / "views", "depth", "a", file_format))
     assert meta is not None
     assert (meta.convention, meta.axis, meta.opacity_floor) == ("conditional", "z", 0.1)
@@ -261,7 +245,7 @@ def test_every_file_says_what_it_is_and_who_saw_it(file_format, model, tmp_path)
 
 def test_maps_beside_depth_state_their_own_convention_and_floor(model, tmp_path):
     """The median exists only where half of the light ends; the spread wherever depth is valid."""
-    noted(model, ordered([frame("a")], formats=("tiff", "exr")), tmp_path / "views")
+    export(model, [frame("a")], tmp_path / "views", outputs=OUTPUTS, formats=("tiff", "exr"))
     for output, convention, floor in (
         ("spread", "standard-deviation", 0.1),
         ("disagreement", "median-conditional", 0.5),
@@ -276,7 +260,8 @@ def test_maps_beside_depth_state_their_own_convention_and_floor(model, tmp_path)
 
 
 def test_levels_of_a_clip_in_metres_are_millimetres(model, tmp_path):
-    notes = noted(model, ordered([frame("a"), frame("b", 3.0)], formats=("png16",)), tmp_path / "views")
+    notes: list[str] = []
+    export(model, [frame("a"), frame("b", 3.0)], tmp_path / "views", notes=notes, formats=("png16",))
     assert "16-bit files: one level is 1 mm, 0 means no value" in notes
     for name, distance in (("a", 2.0), ("b", 3.0)):
         depth = pictured(model, name, distance).depth
@@ -320,7 +305,7 @@ def test_a_few_far_pixels_do_not_make_levels_coarse(tmp_path):
 @pytest.mark.parametrize("file_format", ["tiff", "exr", "npy"])
 def test_a_file_of_another_meaning_is_not_read_into_a_clip(file_format, model, tmp_path):
     """Previews, levels and videos are made from the files: one with another meaning is refused by name."""
-    settings = ordered([], formats=(file_format,)).settings
+    settings = RenderSettings(OUTPUTS, DEPTH, (file_format,))
     meaning = depth_meta(model, DEPTH)
     write_maps(pictured(model), tmp_path, "a", settings=settings, meta=meaning)
     for output in LENGTHS:
@@ -348,8 +333,9 @@ def test_depth_without_a_meaning_is_not_read_into_a_clip(model, tmp_path):
     ],
 )
 def test_a_folder_of_another_kind_is_named_as_such(other, stated, model, tmp_path):
-    noted(model, ordered([frame("a")], outputs=("depth",)), tmp_path / "views")
+    notes: list[str] = []
+    export(model, [frame("a")], tmp_path / "views", outputs=("depth",))
     with pytest.raises(UserError, match=f"views contains depth with another definition: {stated}"):
-        noted(model, ordered([frame("a")], outputs=("depth",), depth=other), tmp_path / "views")
-    (note,) = noted(model, ordered([frame("a")], outputs=("depth",)), tmp_path / "views")
-    assert "is kept" in note
+        export(model, [frame("a")], tmp_path / "views", outputs=("depth",), depth=other)
+    export(model, [frame("a")], tmp_path / "views", notes=notes, outputs=("depth",))
+    assert "is kept" in notes[-1]
