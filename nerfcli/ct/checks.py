@@ -228,13 +228,10 @@ def truncation(sample: Sample) -> Finding:
 
 def repeated_angles(sample: Sample) -> Finding | str:
     """Find views at the same angle, such as 0 and 360 degrees."""
-    angles = _angles(sample.scan.geometry)
-    if angles is None:
+    around = _around(sample.scan.geometry)
+    if around is None:
         return "the views are not on one circle"
-    step = _step(angles)
-    turned = np.mod(angles, 2 * np.pi)
-    order = np.argsort(turned)
-    gaps = np.diff(np.append(turned[order], turned[order][0] + 2 * np.pi))
+    angles, order, gaps, step = around
     same = np.flatnonzero(gaps < _SAME * step)
     pairs = [(int(order[k]), int(order[(k + 1) % len(order)])) for k in same]
     held_out = set(sample.scan.held_out)
@@ -262,22 +259,19 @@ def repeated_angles(sample: Sample) -> Finding | str:
 def missing_wedge(sample: Sample) -> Finding | str:
     """Find the directions that no ray covers."""
     geometry = sample.scan.geometry.select(sample.scan.live_views)
-    angles = _angles(geometry)
-    if angles is None:
+    around = _around(geometry)
+    if around is None:
         return "the views are not on one circle"
-    step = _step(angles)
-    ordered = np.sort(np.mod(angles, 2 * np.pi))
-    gaps = np.diff(np.append(ordered, ordered[0] + 2 * np.pi))
-    widest = int(np.argmax(gaps))
+    angles, order, gaps, step = around
+    widest, fan = int(np.argmax(gaps)), _fan(geometry)
     gap = float(gaps[widest])
-    fan = _fan(geometry)
     # If the gap in the source's path is below half a turn minus the fan, each line is measured from its other end.
     span = 2 * np.pi - (gap if gap > 2 * step else 0.0)
     missing = np.pi - span - (step if geometry.beam == "parallel" else 0.0)
     missing = missing if missing > step / 2 else 0.0
     missing_deg, span_deg = float(np.degrees(missing)), float(np.degrees(span))
     once = span < np.pi + fan - step and missing == 0
-    begin = float(np.degrees(ordered[widest]))
+    begin = float(np.degrees(np.mod(angles[order[widest]], 2 * np.pi)))
     verdict = BAD if missing_deg >= WEDGE_BAD_DEG else LOOK if missing_deg > 0 or once else GOOD
     if missing_deg > 0:
         at = np.mod([begin, begin + missing_deg], 180)
@@ -320,17 +314,17 @@ def few_views(sample: Sample) -> Finding:
     )
 
 
-def _angles(geometry: ScanGeometry) -> np.ndarray | None:
+def _around(geometry: ScanGeometry) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
+    """Return angles of a circular scan, their order around the circle, the gap after each in it, and the usual gap."""
     circle, apart = circle_of(geometry)
-    return np.array(circle.angles) if apart < _ROUND_PX else None
-
-
-def _step(angles: np.ndarray) -> float:
-    """Return the median angle between neighbouring views."""
-    turned = np.sort(np.mod(angles, 2 * np.pi))
-    gaps = np.diff(turned)
-    gaps = gaps[gaps > 1e-9]
-    return float(np.median(gaps)) if len(gaps) else 2 * np.pi
+    if apart >= _ROUND_PX:
+        return None
+    angles = np.array(circle.angles)
+    turned = np.mod(angles, 2 * np.pi)
+    order = np.argsort(turned)
+    gaps = np.diff(turned[order], append=turned[order[0]] + 2 * np.pi)
+    steps = gaps[:-1][gaps[:-1] > 1e-9]
+    return angles, order, gaps, float(np.median(steps)) if len(steps) else 2 * np.pi
 
 
 def _fan(geometry: ScanGeometry) -> float:
