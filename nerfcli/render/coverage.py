@@ -26,7 +26,7 @@ def normals_of_points(points: np.ndarray, depth: np.ndarray) -> np.ndarray:
         points: (H, W, 3) in the axes of the camera.
         depth: (H, W) depth of the points, along the optical axis or along the ray; NaN where unknown.
     """
-    across, down = _slope(points, depth, axis=1), _slope(points, depth, axis=0)
+    across, down = _slope(points.swapaxes(0, 1), depth.T).swapaxes(0, 1), _slope(points, depth)
     normals = np.cross(down, across)
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     normals = np.divide(normals, length, out=np.full_like(normals, np.nan), where=length > 0)
@@ -35,21 +35,13 @@ def normals_of_points(points: np.ndarray, depth: np.ndarray) -> np.ndarray:
     return np.where(away[..., None], -normals, normals).astype(np.float32)
 
 
-def _slope(points: np.ndarray, depth: np.ndarray, *, axis: int) -> np.ndarray:
-    """Return the change of the points per pixel along an axis, NaN where neither neighbour is on the same surface."""
-    missing = np.full_like(np.take(points, [0], axis), np.nan)
-    steps = np.diff(points, axis=axis)
-    jump = np.abs(np.diff(depth, axis=axis)) > _STEP * np.minimum(*_sides(depth, axis))
-    steps[jump] = np.nan
-    after, before = np.concatenate([steps, missing], axis), np.concatenate([missing, steps], axis)
+def _slope(points: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Return the change of the points per row of pixels, NaN where neither neighbour is on the same surface."""
+    missing, steps = np.full_like(points[:1], np.nan), np.diff(points, axis=0)
+    steps[np.abs(np.diff(depth, axis=0)) > _STEP * np.minimum(depth[:-1], depth[1:])] = np.nan
+    after, before = np.concatenate([steps, missing]), np.concatenate([missing, steps])
     both = (after + before) / 2
     return np.where(np.isnan(both), np.where(np.isnan(after), before, after), both)
-
-
-def _sides(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values without the last, and without the first, along an axis."""
-    count = values.shape[axis]
-    return np.take(values, range(count - 1), axis), np.take(values, range(1, count), axis)
 
 
 # Longer side of the depth maps of the photos, pixels.
