@@ -1,10 +1,11 @@
-"""Frames: a camera, its pose and its picture; found by name."""
+"""Frames: a camera, its pose and its picture; found by name, or chosen evenly."""
 
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.errors import UserError
 
 MILLIMETRE = 1e-3
+Item = TypeVar("Item")
 # Width and height in pixels.
 Size = tuple[int, int]
 
@@ -106,3 +108,8 @@ def _named(name: str, whole: dict[str, Frame], endings: dict[str, list[Frame]]) 
         raise UserError(f"{len(found)} images match {name}: {several}", "give a longer part of the name")
     near = get_close_matches(name, whole, n=3, cutoff=0.5) or list(whole)[:3]
     raise UserError(f"no image is named {name!r}", f"there are {len(whole)}, such as {', '.join(near)}")
+
+
+def chosen_evenly(items: Sequence[Item], count: int) -> list[Item]:
+    """Choose at most `count` frames or other items, evenly spread in their order, from the first to the last."""
+    return [items[index] for index in np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).astype(int))]

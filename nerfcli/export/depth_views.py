@@ -105,13 +105,6 @@ def _small_pinholes(frame: Frame, max_size: int) -> list[Frame]:
     return [replace(frame, camera=face, world_from_cam=turned) for turned in poses]
 
 
-def spread_frames(frames: Sequence[Frame], count: int) -> list[Frame]:
-    """Choose at most `count` frames, evenly spread in their order."""
-    if len(frames) <= count:
-        return list(frames)
-    return [frames[index] for index in np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
-
-
 def plane_rays(camera: Camera) -> np.ndarray:
     """Return directions (H, W, 3) with z = 1 through a pinhole camera's pixel centres, in its axes."""
     fx, fy, cx, cy = camera.params

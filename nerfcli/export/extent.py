@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.frame import Frame, chosen_evenly
 from nerfcli.errors import UserError
-from nerfcli.export.depth_views import DepthView, depth_views, spread_frames
+from nerfcli.export.depth_views import DepthView, depth_views
 from nerfcli.render.model import Model
 
 # Longer side in pixels of the pictures whose depths are fused, and most photos to render.
@@ -106,7 +106,7 @@ def scene_box(model: Model, frames: Sequence[Frame]) -> tuple[float, ...]:
         UserError: no ray sees a surface.
     """
     # A few small views show the extent.
-    views = depth_views(model, spread_frames(frames, 24), max_size=64)
+    views = depth_views(model, chosen_evenly(frames, 24), max_size=64)
     points = np.concatenate([view.points()[np.isfinite(view.depth)] for view in views])
     reach = np.sqrt(3.0) if model.contraction == "none" else 1.0
     if not len(points):

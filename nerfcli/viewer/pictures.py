@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import KDTree
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.frame import Frame, chosen_evenly
 from nerfcli.cameras.layout import centres_of
 from nerfcli.pages.page import data_uri, jpeg_bytes
 from nerfcli.photos.colours import over_white
@@ -58,7 +58,7 @@ def page_photos(
     """
     frames = _sorted(train, test)
     there = [index for index, (frame, _) in enumerate(frames) if frame.image is not None and frame.image.exists()]
-    shown = [there[i] for i in np.unique(np.linspace(0, len(there) - 1, min(len(there), MOST_PICTURES)).astype(int))]
+    shown = chosen_evenly(there, MOST_PICTURES)
     longest = _longest(frames, shown, room_bytes)
     pictures = {}
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
@@ -185,7 +185,7 @@ def make_proof(model: Model, frames: Sequence[Frame]) -> Proof:
     Args:
         frames: pinhole frames, at least one.
     """
-    chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, CAMERAS).astype(int))]
+    chosen = chosen_evenly(frames, CAMERAS)
     small = [Frame(frame.name, _small(frame.camera), frame.world_from_cam) for frame in chosen]
     columns = [values for frame in small for values in _maps(model, frame)]
     description = {

@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from nerfcli.cameras.frame import chosen_evenly
 from nerfcli.errors import UserError
-from nerfcli.export.depth_views import DepthView, depth_views, spread_frames, surface_colours
+from nerfcli.export.depth_views import DepthView, depth_views, surface_colours
 from nerfcli.export.extent import MOST_VIEWS, Grid, SurfaceSettings, automatic_voxel, scene_box
 from nerfcli.export.fusion import agreed_points, fuse
 from nerfcli.export.meshes import simplified, surface_of, without_small_pieces, write_glb, write_obj
@@ -174,7 +175,7 @@ def _export_points(run: Run, model: Model, path: Path, *, settings: SurfaceSetti
 
 def _seen(run: Run, model: Model, settings: SurfaceSettings, reporter: Reporter) -> tuple[list[DepthView], Grid]:
     """Return depth maps of the training cameras, and the grid to fuse them in."""
-    chosen = spread_frames(run.cameras.train, MOST_VIEWS)
+    chosen = chosen_evenly(run.cameras.train, MOST_VIEWS)
     box = settings.box or scene_box(model, run.cameras.train)
     views = depth_views(
         model, chosen, max_size=settings.max_size, on_progress=reporter.part(0.02, _DEPTHS, "rendering depths")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from nerfcli.cameras.frame import chosen_evenly
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import UserError, duration
@@ -275,12 +276,9 @@ def _before(settings: SplatSettings) -> str:
 
 def compared_in_words(model: Model, loaded: Sequence[LoadedPhoto], splats: RunSplats) -> str:
     """Compare field and splats on random pixels of training photos, and say how much longer to refine if needed."""
-    chosen = np.unique(np.linspace(0, len(loaded) - 1, COMPARED).astype(int))
     photos = [
-        HeldOutPhoto(
-            loaded[index].frame, loaded[index].pixels, loaded[index].used, tuple(splats.log_gains[index].tolist())
-        )
-        for index in chosen
+        HeldOutPhoto(photo.frame, photo.pixels, photo.used, tuple(gains.tolist()))
+        for photo, gains in chosen_evenly(list(zip(loaded, splats.log_gains, strict=True)), COMPARED)
     ]
     pixels = SampledPixels.drawn(photos, seed=0)
     of_field, of_splats = pixels.psnr(model), pixels.psnr_of_pictures(scene_of(splats, model))
