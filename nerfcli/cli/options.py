@@ -36,31 +36,6 @@ Device = Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:1.")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.", min=0, max=2**32 - 1)]
 Threads = Annotated[int, typer.Option(help="Number of CPU threads; 0 uses all.", min=0)]
 Downscale = Annotated[str, typer.Option(help="Reduce photos by this factor: auto, 1, 2, 4 or 8.")]
-Include = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--with",
-        metavar="NAME[=VALUE],...",
-        help="Components to enable; nerfcli train --help lists them. Repeatable.",
-        callback=split_at_commas,
-    ),
-]
-Exclude = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--without",
-        metavar="NAME,...",
-        help="Components to disable; nerfcli train --help lists them. Repeatable.",
-        callback=split_at_commas,
-    ),
-]
-ModelChoice = Annotated[
-    str,
-    typer.Option(
-        "--model",
-        help="auto: select components for this scene with short trainings; default: use the default components.",
-    ),
-]
 Require = Annotated[
     str | None,
     typer.Option(
@@ -71,32 +46,6 @@ Holdout = Annotated[
     str | None,
     typer.Option(
         help="Photos to hold out: every:8, block:0.15 (the middle of the capture), or a file with names.",
-        show_default=False,
-    ),
-]
-FieldKind = Annotated[
-    str | None,
-    typer.Option("--field", help="Type of field: hash, voxels or mlp.  [default: hash]"),
-]
-FieldMemory = Annotated[
-    str | None,
-    typer.Option(
-        help="Approximate size of the parameters: 4MB, 64MB.  [default: hash 8 to 64MiB by the budget, voxels 64MiB, "
-        "mlp 256KiB]"
-    ),
-]
-Contraction = Annotated[
-    str,
-    typer.Option(
-        help="Map distant space into a ball (l2), or not at all (none); auto: l2, but none for photos with alpha."
-    ),
-]
-DeviceMemory = Annotated[
-    str | None,
-    typer.Option(
-        "--memory",
-        help="Memory limit, of the GPU with --device cuda: 4GB, 500MB.  [default: 4/5 of the machine's memory, or what "
-        "is free on the GPU]",
         show_default=False,
     ),
 ]
@@ -164,10 +113,11 @@ class Training(Computing):
         """
         from nerfcli.training.runs.settings import TrainSettings
 
+        one_of(self.downscale, ("auto", "1", "2", "4", "8"), "--downscale")
         return TrainSettings(
             budget_seconds=None if budget is None else seconds_from_text(budget),
             steps=steps,
-            downscale=downscale_factor(self.downscale),
+            downscale=None if self.downscale == "auto" else int(self.downscale),
             seed=self.seed,
             device=self.resources.torch_device,
             threads=self.resources.cores,
@@ -252,23 +202,6 @@ def seconds_from_text(text: str, option: str = "--budget") -> float:
     if match and not match[2] and seconds < FEWEST_PLAIN_SECONDS:
         raise typer.BadParameter(f"{text!r} has no unit; write {match[1]}s or {match[1]}m", param_hint=option)
     return seconds
-
-
-def downscale_factor(downscale: str) -> int | None:
-    """Parse --downscale: 1, 2, 4 or 8; None for auto."""
-    one_of(downscale, ("auto", "1", "2", "4", "8"), "--downscale")
-    return None if downscale == "auto" else int(downscale)
-
-
-def named_components(included: list[str] | None, excluded: list[str] | None) -> tuple[str, ...]:
-    """Return the component names in --with NAME[=VALUE] and --without NAME, without duplicates."""
-    return tuple(sorted({text.partition("=")[0] for text in (*(included or ()), *(excluded or ()))}))
-
-
-def contraction_name(contraction: str) -> str | None:
-    """Parse --contraction: none or l2; None for auto."""
-    one_of(contraction, ("auto", "none", "l2"), "--contraction")
-    return None if contraction == "auto" else contraction
 
 
 def bytes_from_text(text: str, option: str = "--memory") -> int:

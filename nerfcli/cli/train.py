@@ -35,12 +35,45 @@ class Fit:
             "--no-sensor-depth", help="Ignore depth maps of a sensor, like --without sensor.", show_default=False
         ),
     ] = True
-    include: options.Include = None
-    exclude: options.Exclude = None
-    field: options.FieldKind = None
-    field_memory: options.FieldMemory = None
-    model: options.ModelChoice = "auto"
-    contraction: options.Contraction = "auto"
+    include: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--with",
+            metavar="NAME[=VALUE],...",
+            help="Components to enable; nerfcli train --help lists them. Repeatable.",
+            callback=options.split_at_commas,
+        ),
+    ] = None
+    exclude: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--without",
+            metavar="NAME,...",
+            help="Components to disable; nerfcli train --help lists them. Repeatable.",
+            callback=options.split_at_commas,
+        ),
+    ] = None
+    field: Annotated[str | None, typer.Option(help="Type of field: hash, voxels or mlp.  [default: hash]")] = None
+    field_memory: Annotated[
+        str | None,
+        typer.Option(
+            help="Approximate size of the parameters: 4MB, 64MB.  [default: hash 8 to 64MiB by the budget, voxels "
+            "64MiB, mlp 256KiB]"
+        ),
+    ] = None
+    model: Annotated[
+        str,
+        typer.Option(
+            help="auto: select components for this scene with short trainings; default: use the default components.",
+        ),
+    ] = "auto"
+    contraction: Annotated[
+        str,
+        typer.Option(
+            help="Map distant space into a ball (l2), or not at all (none); auto: l2, but none for photos with alpha or "
+            "of an object before a plain background."
+        ),
+    ] = "auto"
     log2_rows: Annotated[
         int | None,
         typer.Option(
@@ -58,7 +91,14 @@ class Fit:
             show_default=False,
         ),
     ] = None
-    memory: options.DeviceMemory = None
+    memory: Annotated[
+        str | None,
+        typer.Option(
+            help="Memory limit, of the GPU with --device cuda: 4GB, 500MB.  [default: 4/5 of the machine's memory, or "
+            "what is free on the GPU]",
+            show_default=False,
+        ),
+    ] = None
     holdout: options.Holdout = None
     resume: Annotated[
         bool,
@@ -83,16 +123,17 @@ class Fit:
         if self.field not in (None, "hash") and self.log2_rows is not None:
             message = "it works with --field hash; for other fields, give --field-memory"
             raise typer.BadParameter(message, param_hint="--log2-rows")
+        options.one_of(self.contraction, ("auto", "none", "l2"), "--contraction")
         excluded = [*(self.exclude or ()), *([] if self.sensor_depth else ["sensor"])]
         budget = DEFAULT_BUDGET if self.budget is None and self.steps is None else self.budget
         sized = training.settings(budget, self.steps)
         size = None if self.field_memory is None else options.bytes_from_text(self.field_memory, "--field-memory")
         return replace(
             sized,
-            contraction=options.contraction_name(self.contraction),
+            contraction=None if self.contraction == "auto" else self.contraction,
             components=choose(Components(), included=self.include or (), excluded=excluded),
             model=options.one_of(self.model, ("auto", "default"), "--model"),
-            fixed=options.named_components(self.include, excluded),
+            fixed=tuple(sorted({text.partition("=")[0] for text in (*(self.include or ()), *excluded)})),
             samples_per_step=self.batch,
             log2_rows=self.log2_rows,
             field=options.one_of(self.field or "hash", KINDS, "--field"),
