@@ -10,6 +10,7 @@ import typer.testing
 from typer.testing import CliRunner, Result
 
 from nerfcli import cli
+from nerfcli.errors import BAD_INPUT
 
 # Otherwise each call of the runner would rebuild all commands, which takes as long as most refusals of an input.
 typer.testing._get_command = cache(typer.testing._get_command)
@@ -29,6 +30,13 @@ def error_of(result: Result) -> tuple[str, str]:
     assert len(lines) == 2, result.stderr
     assert "Traceback" not in result.stderr
     return lines[0], lines[1]
+
+
+def refusal(*arguments: str | Path, exit_code: int = BAD_INPUT, stdin: str | None = None) -> tuple[str, str]:
+    """Return the error and the hint of a command that is refused, after checking its exit code."""
+    result = nerfcli(*arguments, stdin=stdin)
+    assert result.exit_code == exit_code, (arguments, result.stderr)
+    return error_of(result)
 
 
 def estimated_poses() -> SimpleNamespace:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from commands import error_of, listing, nerfcli
+from commands import error_of, listing, nerfcli, refusal
 
 from nerfcli.errors import BAD_INPUT, OUT_OF_MEMORY
 
@@ -39,10 +39,9 @@ def test_commands_for_photos_name_the_command_for_a_scan(command, scanned, tmp_p
         (scanned / "scan", "an X-ray scan", f"{same['scan']} {scanned / 'scan'}"),
         (scanned / "run", "the reconstruction of an X-ray scan", f"{same['run']} {scanned / 'run'}"),
     ):
-        result = nerfcli(command, path, *(("--to", "mesh") if command == "export" else ()))
-        assert result.exit_code == BAD_INPUT
         error = f"Error: {path} is {what}, and {command} is for photos"
-        assert error_of(result) == (error, f"Hint:  use nerfcli ct {suited}")
+        given = (command, path, *(("--to", "mesh") if command == "export" else ()))
+        assert refusal(*given) == (error, f"Hint:  use nerfcli ct {suited}")
     volume = scanned / "volume.nrrd"
     assert error_of(nerfcli("info", volume))[1] == f"Hint:  use nerfcli ct info {volume}"
     if command in ("train", "render", "convert"):
@@ -74,9 +73,8 @@ def test_a_scan_is_recognised_before_anything_heavy_is_loaded():
 def test_json_nested_too_deeply_is_refused_and_not_a_traceback(tmp_path):
     """Before the format of IN is known, each reader looks into it."""
     (tmp_path / "reconstruction.json").write_text("[" * 100_000)
-    result = nerfcli("convert", tmp_path / "reconstruction.json", tmp_path / "out", "--to", "transforms")
-    assert result.exit_code == BAD_INPUT
-    assert "not valid JSON" in error_of(result)[0]
+    error, _ = refusal("convert", tmp_path / "reconstruction.json", tmp_path / "out", "--to", "transforms")
+    assert "not valid JSON" in error
 
 
 @pytest.mark.parametrize(
@@ -133,9 +131,7 @@ def test_a_folder_that_cannot_be_written_is_found_before_the_work(command, finis
     (run / "metrics.json").unlink(missing_ok=True)
     before = listing(tmp_path)
     monkeypatch.setattr("nerfcli.atomic.os.access", lambda path, mode: False)
-    result = nerfcli(command, run, *(("--to", "mesh") if command == "export" else ()))
-    assert result.exit_code == BAD_INPUT
-    error, hint = error_of(result)
+    error, hint = refusal(command, run, *(("--to", "mesh") if command == "export" else ()))
     assert error.startswith("Error: cannot write ")
     assert error.endswith(": no write permission")
     assert hint.startswith("Hint:  make ")
@@ -165,8 +161,7 @@ def test_resuming_what_has_used_its_budget_changes_nothing(capture, tmp_path):
         assert result.stderr.splitlines()[1:2] == [
             f"{run} is kept: its training has used this budget; give a larger --budget or --steps"
         ]
-    refused = nerfcli(*train, "--seed", "4", "--resume")
-    assert refused.exit_code == BAD_INPUT
-    assert error_of(refused)[0].endswith(f"{run} was trained with seed=3, not seed=4")
-    assert error_of(refused)[1].endswith("train into a new folder with -o, or replace it: --overwrite without --resume")
+    error, hint = refusal(*train, "--seed", "4", "--resume")
+    assert error.endswith(f"{run} was trained with seed=3, not seed=4")
+    assert hint.endswith("train into a new folder with -o, or replace it: --overwrite without --resume")
     assert listing(run) == before

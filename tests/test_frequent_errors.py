@@ -7,11 +7,11 @@ import shutil
 from pathlib import Path
 
 import pytest
-from commands import error_of, listing, nerfcli
+from commands import error_of, listing, nerfcli, refusal
 from every_format import WITH_PHOTOS, Views
 from test_odd_inputs import CAMERA, POSES, photos
 
-from nerfcli.errors import BAD_INPUT, OUT_OF_MEMORY
+from nerfcli.errors import OUT_OF_MEMORY
 
 
 def project(folder: Path) -> Path:
@@ -39,9 +39,7 @@ def test_no_photos_are_found(command, files, said, tmp_path):
         else:
             (tmp_path / name).write_bytes(b"x")
     before = listing(tmp_path)
-    result = nerfcli(command, tmp_path)
-    assert result.exit_code == BAD_INPUT
-    error, hint = error_of(result)
+    error, hint = refusal(command, tmp_path)
     assert f"no photos and no scene in {tmp_path}" in error or f"no photos in {tmp_path}" in error
     assert said.format(tmp_path) in hint
     assert listing(tmp_path) == before
@@ -50,9 +48,7 @@ def test_no_photos_are_found(command, files, said, tmp_path):
 @pytest.mark.parametrize("command", ["train", "info"])
 def test_the_folder_around_a_capture_is_given(command, tmp_path):
     one = project(tmp_path / "one")
-    result = nerfcli(command, tmp_path)
-    assert result.exit_code == BAD_INPUT
-    assert error_of(result) == (
+    assert refusal(command, tmp_path) == (
         f"Error: {tmp_path} contains no capture",
         f"Hint:  there is one in {one}: give that folder",
     )
@@ -66,9 +62,7 @@ def test_the_folder_around_a_capture_is_given(command, tmp_path):
 def test_the_folder_of_photos_in_a_capture_is_given(tmp_path):
     one = project(tmp_path / "one")
     inside = next(path for path in one.iterdir() if path.name != "sparse")
-    result = nerfcli("train", inside)
-    assert result.exit_code == BAD_INPUT
-    assert error_of(result) == (
+    assert refusal("train", inside) == (
         f"Error: {inside} has 8 photos but no cameras",
         f"Hint:  those of {one} are used if you give that folder, or estimate them with: nerfcli poses {inside}",
     )
@@ -85,9 +79,8 @@ def test_a_folder_or_file_of_the_model_is_given(given, tmp_path):
 
 def test_photos_and_field_do_not_fit_into_memory(capture, tmp_path):
     before = listing(capture)
-    result = nerfcli("train", capture, "-o", tmp_path / "run", "--memory", "10MB", "--budget", "1s")
-    assert result.exit_code == OUT_OF_MEMORY
-    error, hint = error_of(result)
+    arguments = ("train", capture, "-o", tmp_path / "run", "--memory", "10MB", "--budget", "1s")
+    error, hint = refusal(*arguments, exit_code=OUT_OF_MEMORY)
     assert "of memory in addition to the photos, but the limit is 0.01 GB" in error
     assert "--downscale 4" in hint
     assert listing(capture) == before

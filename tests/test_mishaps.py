@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import error_of, listing, nerfcli, started
+from commands import error_of, listing, nerfcli, refusal, started
 from full_disk import files_of_at_most
 
 from nerfcli import atomic, kernels
@@ -144,9 +144,7 @@ def test_a_run_whose_photos_were_moved_elsewhere_says_which_and_how_to_mend_it(f
     moved = capture.parent / "elsewhere" / "run"
     shutil.copytree(finished, moved)
     photos = capture.rename(capture.with_name("photos elsewhere"))
-    result = nerfcli("evaluate", moved)
-    assert result.exit_code == BAD_INPUT
-    error, hint = error_of(result)
+    error, hint = refusal("evaluate", moved)
     missing = moved.parent / "spheres" / "test" / "r_000.png"
     assert error == f"Error: photo not found: {missing}"
     assert "put a link to the photo folder there" in hint
