@@ -24,6 +24,13 @@ def nerfcli(*arguments: str | Path, stdin: str | None = None) -> Result:
     return result
 
 
+def completed(*arguments: str | Path, stdin: str | None = None) -> Result:
+    """Return the result of a command that succeeds, after checking its exit code."""
+    result = nerfcli(*arguments, stdin=stdin)
+    assert result.exit_code == 0, (arguments, result.stderr)
+    return result
+
+
 def error_of(result: Result) -> tuple[str, str]:
     """Return the error and the hint of a failed command, after checking that stderr has exactly one of each."""
     lines = [line for line in result.stderr.splitlines() if line.startswith(("Error:", "Hint:"))]

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import typer.main
-from commands import error_of, estimated_poses, listing, nerfcli, refusal, started
+from commands import completed, error_of, estimated_poses, listing, nerfcli, refusal, started
 from PIL import Image
 from typer.exceptions import TyperException
 
@@ -95,8 +95,7 @@ def needed(command: str, folder: Path) -> tuple[Any, ...]:
 
 @pytest.mark.parametrize("command", [*COMMANDS, *WITHOUT_INPUT, *(f"ct {command}" for command in OF_SCANS)])
 def test_help_has_examples_that_parse(command):
-    result = nerfcli(*command.split(), "--help")
-    assert result.exit_code == 0
+    result = completed(*command.split(), "--help")
     assert "[default: True]" not in " ".join(result.stdout.split())  # of a flag that switches something off
     after = result.stdout.split("Examples:")[1]
     examples = [line.strip() for line in after.splitlines() if re.match(rf"\s+.*nerfcli {command} ", line)]
@@ -106,8 +105,7 @@ def test_help_has_examples_that_parse(command):
 
 
 def test_help_lists_every_command_and_the_exit_codes():
-    result = nerfcli("--help")
-    assert result.exit_code == 0
+    result = completed("--help")
     assert all(re.search(rf"^\s+{command}\b", result.stdout, re.M) for command in (*COMMANDS, *WITHOUT_INPUT))
     assert "..." not in result.stdout.split("Commands:")[1]  # no description is cut short
     assert "130 interrupted; 143 ended by SIGTERM" in re.sub(r"\s+", " ", result.stdout)
@@ -363,8 +361,7 @@ def test_train_evaluate_render_info_in_a_row(capture):
     trained = nerfcli("train", capture, *QUICK)
     assert trained.stderr.startswith(f"{capture}: blender (NeRF's synthetic scenes), 5 of 5 photos on disk\n")
     assert (trained.exit_code, trained.stdout) == (0, f"{run}\n")
-    evaluated = nerfcli("evaluate", run, "--json")
-    assert evaluated.exit_code == 0
+    evaluated = completed("evaluate", run, "--json")
     metrics = json.loads(evaluated.stdout)
     assert metrics["path"] == str(run / "metrics.json")
     assert set(metrics["mean"]) >= {"psnr", "ssim", "lpips", "psnr_float", "ssim_float", "psnr_colour_aligned"}
@@ -443,8 +440,7 @@ def test_a_batch_goes_on_after_a_bad_path(capture, tmp_path):
     assert error.startswith(f"Error: {tmp_path / 'missing'}")
     assert (capture.with_name("spheres-run") / "field.safetensors").exists()
     # The results on stdout are the input of the next command, unchanged.
-    result = nerfcli("evaluate", "-", "--json", stdin=result.stdout)
-    assert result.exit_code == 0
+    result = completed("evaluate", "-", "--json", stdin=result.stdout)
     paths = [json.loads(line)["path"] for line in result.stdout.splitlines()]
     assert paths == [f"{capture}-run/metrics.json", f"{other}-run/metrics.json"]
 
@@ -553,12 +549,10 @@ def test_a_finished_training_is_kept_another_one_refused_and_overwritten_on_dema
     assert "exists" in error
     assert "add --resume to continue it with its own settings, --overwrite to replace it" in hint
     assert listing(run) == before
-    replaced = nerfcli("train", capture, *QUICK, "--seed", "5", "--overwrite")
-    assert replaced.exit_code == 0
+    completed("train", capture, *QUICK, "--seed", "5", "--overwrite")
     assert listing(run)["field.safetensors"] != before["field.safetensors"]
     assert [entry["step"] for entry in read_log(run)] == [1]
-    longer = nerfcli("train", capture, "--steps", "2", "--downscale", "8", "--seed", "5", "--resume")
-    assert longer.exit_code == 0
+    longer = completed("train", capture, "--steps", "2", "--downscale", "8", "--seed", "5", "--resume")
     assert "resumed at step 1" in longer.stderr
 
 
@@ -567,8 +561,7 @@ def test_masks_of_an_earlier_training_are_removed_unless_the_scene_has_them(capt
     assert nerfcli("train", capture, *QUICK).exit_code == 0
     first = load_scene(capture).train_frames[0]
     write_masks(run / "occluders", {first.name: np.zeros((first.camera.height, first.camera.width), bool)})
-    converted = nerfcli("convert", capture, masked, "--to", "nerfcli", "--masks", run / "occluders")
-    assert converted.exit_code == 0, converted.stderr
+    completed("convert", capture, masked, "--to", "nerfcli", "--masks", run / "occluders")
     for option in ("--overwrite", "--resume"):
         assert "holds masks that this scene uses, such as" in refusal("train", masked, *QUICK, "-o", run, option)[0]
     assert len(list(run.glob("*/**/*.png"))) == 1
@@ -891,8 +884,7 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
     nerfcli("evaluate", run)
     assert "report.html is kept" not in nerfcli(*arguments).stderr
 
-    longer = nerfcli(*("0.4s" if argument == "0.2s" else argument for argument in arguments))
-    assert longer.exit_code == 0, longer.stderr
+    longer = completed(*("0.4s" if argument == "0.2s" else argument for argument in arguments))
     assert f"resumed at step {load_run(run).log[-1]['step']}" not in longer.stderr
     assert "resumed at step" in longer.stderr
     assert longer.stdout == first.stdout
@@ -904,13 +896,11 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
     assert nerfcli(*arguments).exit_code == 0  # a smaller budget than that of the training, which is kept
     assert listing(run) == before
     assert nerfcli("export", run, "--to", "splats", "--sh", "1", "--budget", "0.1s", "--overwrite").exit_code == 0
-    refined = nerfcli(*arguments)
-    assert refined.exit_code == 0, refined.stderr
+    completed(*arguments)
     made = json.loads((run / "renders" / "orbit-conditional-z-splats" / "render.json").read_text())
     assert made["splats_sha256"] == file_digest(tmp_path / "all" / "run-splats.ply")
     (run / "splats.safetensors").unlink()  # the file is kept, and only the field that the film names is another
-    longest = nerfcli(*("0.6s" if argument == "0.2s" else argument for argument in arguments))
-    assert longest.exit_code == 0, longest.stderr
+    completed(*("0.6s" if argument == "0.2s" else argument for argument in arguments))
 
 
 # Processes of their own
@@ -969,8 +959,7 @@ def test_ctrl_c_and_sigterm_save_a_checkpoint_and_say_how_to_go_on(stopped, exit
     assert {path.name for path in run.iterdir()} >= {"config.json", "field.safetensors", "state.safetensors"}
     assert not list(run.rglob("*partial*"))
     trained = read_log(run)[-1]
-    resumed = nerfcli("train", capture, "-o", run, "--resume", "--steps", str(trained["step"] + 2), *SMALL)
-    assert resumed.exit_code == 0, resumed.stderr
+    resumed = completed("train", capture, "-o", run, "--resume", "--steps", str(trained["step"] + 2), *SMALL)
     assert f"resumed at step {trained['step']}, " in resumed.stderr
     assert read_log(run)[-1]["step"] == trained["step"] + 2
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from commands import error_of, nerfcli
+from commands import completed, error_of, nerfcli
 from fog import fog, foggy_cells
 from PIL import Image
 
@@ -315,8 +315,7 @@ def test_a_photo_sees_nothing_where_its_mask_covers_it(run, tmp_path):
 
 def test_a_mesh_says_how_many_photos_see_its_points(run, tmp_path):
     path = tmp_path / "a.ply"
-    result = nerfcli("export", run, "--to", "mesh", "--voxel-size", "0.1", "-o", path)
-    assert result.exit_code == 0, result.stderr
+    completed("export", run, "--to", "mesh", "--voxel-size", "0.1", "-o", path)
     header = read_ply_header(path)
     assert {"photos", "parallax_deg"} <= header.vertex_properties.keys()
     assert any("largest angle between the rays of two photos" in comment for comment in header.comments)

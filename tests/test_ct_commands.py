@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+from commands import completed, nerfcli, refusal
 from ellipsoids import attenuation_of_voxels, bean
 from scan_of_phantom import phantom_circle, scan_of_phantom
 from test_reconstruct import cone, scan_of
-from typer.testing import CliRunner
 
-from nerfcli.cli import app
 from nerfcli.ct.evaluate import score_projections, score_volume
 from nerfcli.ct.export import VolumeFile, export_scan, read_volume, write_volume
 from nerfcli.ct.formats.assemble import axis_column
@@ -37,11 +36,6 @@ from nerfcli.output import Output
 from nerfcli.photos.images import read_image
 
 
-def call(*arguments: str | Path) -> tuple[int, str, str]:
-    result = CliRunner().invoke(app, ["ct", *(str(a) for a in arguments)])
-    return result.exit_code, result.stdout, result.stderr
-
-
 @pytest.fixture(scope="module")
 def bean_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scan of the bean with its truth beside it, and the run that `train` made of it."""
@@ -59,9 +53,8 @@ def bean_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "size": grid.size,
     }
     save_scan(folder / "bean", replace(scan, history={"truth": described}))
-    code, out, err = call("train", folder / "bean", "--passes", "8", "--centre", "0", "--tilt", "0")
-    assert code == 0, err
-    assert out.strip() == str(folder / "bean-run")
+    trained = completed("ct", "train", folder / "bean", "--passes", "8", "--centre", "0", "--tilt", "0")
+    assert trained.stdout.strip() == str(folder / "bean-run")
     return folder / "bean-run"
 
 
@@ -71,19 +64,14 @@ def test_train_says_what_it_decided_and_keeps_a_run(bean_run: Path) -> None:
     assert any("model error" in sentence for sentence in result.decisions)
     assert result.grid.size == pytest.approx(0.8)
     scan = bean_run.with_name("bean")
-    again = ("train", scan, "--passes", "8", "--centre", "0", "--tilt", "0")
-    code, _, err = call(*again)
-    assert code == 0
-    assert "is kept" in err
-    code, _, err = call("train", scan, "--passes", "9")
-    assert code == 3
-    assert "another reconstruction" in err
+    again = ("ct", "train", scan, "--passes", "8", "--centre", "0", "--tilt", "0")
+    assert "is kept" in completed(*again).stderr
+    assert "another reconstruction" in refusal("ct", "train", scan, "--passes", "9")[0]
 
 
 def test_evaluate_compares_with_other_methods(bean_run: Path) -> None:
-    code, out, err = call("evaluate", bean_run, "--json", "--overwrite")
-    assert code == 0, err
-    methods = json.loads(out.splitlines()[-1])["methods"]
+    result = completed("ct", "evaluate", bean_run, "--json", "--overwrite")
+    methods = json.loads(result.stdout.splitlines()[-1])["methods"]
     assert set(methods) == {"nerfcli", "filtered back-projection", "SART with total variation"}
     own = methods["nerfcli"]
     assert own["volume"]["psnr"] > methods["SART with total variation"]["volume"]["psnr"]
@@ -93,59 +81,47 @@ def test_evaluate_compares_with_other_methods(bean_run: Path) -> None:
 
 
 def test_a_reconstruction_is_compared_with_a_reference_that_is_no_truth(bean_run: Path) -> None:
-    code, out, err = call("evaluate", bean_run, "--reference", bean_run, "--json", "--overwrite")
-    assert code == 0, err
-    assert f"the reference {bean_run} is a reconstruction, not the truth" in err
-    metrics = json.loads(out.splitlines()[-1])
+    result = completed("ct", "evaluate", bean_run, "--reference", bean_run, "--json", "--overwrite")
+    assert f"the reference {bean_run} is a reconstruction, not the truth" in result.stderr
+    metrics = json.loads(result.stdout.splitlines()[-1])
     assert metrics["reference"]["run"] == str(bean_run)
     assert metrics["methods"]["nerfcli"]["against_reference"]["psnr"] > 200  # itself
     other = metrics["methods"]["SART with total variation"]
     assert 10 < other["against_reference"]["psnr"] < 60
     assert other["against_reference"]["psnr"] != other["volume"]["psnr"]
-    assert call("evaluate", bean_run, "--reference", bean_run)[0] == 0  # kept
-    assert call("evaluate", bean_run)[0] == 0
-    code, _, err = call("evaluate", bean_run, "--reference", bean_run.parent / "other")
-    assert code == 3
-    code, _, err = call("evaluate", bean_run, "--overwrite")
-    assert code == 0
-    code, _, err = call("evaluate", bean_run, "--reference", bean_run)
-    assert code == 3
-    assert "was measured without the reference" in err
+    completed("ct", "evaluate", bean_run, "--reference", bean_run)  # kept
+    completed("ct", "evaluate", bean_run)
+    refusal("ct", "evaluate", bean_run, "--reference", bean_run.parent / "other")
+    completed("ct", "evaluate", bean_run, "--overwrite")
+    error, _ = refusal("ct", "evaluate", bean_run, "--reference", bean_run)
+    assert "was measured without the reference" in error
 
 
 def test_render_writes_projections_residuals_and_slices(bean_run: Path, tmp_path: Path) -> None:
-    code, out, err = call("render", bean_run, "--outputs", "projection,residual", "-o", tmp_path / "pictures")
-    assert code == 0, err
-    assert len(out.splitlines()) == 10
+    views = completed("ct", "render", bean_run, "--outputs", "projection,residual", "-o", tmp_path / "pictures")
+    assert len(views.stdout.splitlines()) == 10
     residual = tifffile.imread(tmp_path / "pictures" / "residual" / "0006.tif")
     assert residual.shape == (18, 30)
     assert 0.8 < float(np.sqrt(np.mean(residual**2))) < 2.5
     assert read_image(tmp_path / "pictures" / "projection" / "0000.png").shape == (18, 30, 3)
-    code, out, err = call("render", bean_run, "--slices", "z=0.3", "-o", tmp_path / "slices")
-    assert code == 0, err
+    slices = completed("ct", "render", bean_run, "--slices", "z=0.3", "-o", tmp_path / "slices")
     picture = tifffile.imread(tmp_path / "slices" / "z=0.3.tif")
     result = load_reconstruction(bean_run)
     np.testing.assert_array_equal(picture[::-1], slice_of(result, "z", 0.3))
     marked = tifffile.imread(tmp_path / "slices" / "z=0.3-marks.tif")
     np.testing.assert_array_equal(marked[::-1], result.marks[int(np.argmin(np.abs(result.grid.axis("z") - 0.3)))])
-    assert out.splitlines() == [str(tmp_path / "slices" / f"z=0.3{end}.tif") for end in ("", "-marks")]
-    code, _, err = call("render", bean_run, "--slices", "z=400")
-    assert code == 3
-    assert "outside the volume" in err
-    assert call("render", bean_run, "--slices", "w=1")[0] == 2
+    assert slices.stdout.splitlines() == [str(tmp_path / "slices" / f"z=0.3{end}.tif") for end in ("", "-marks")]
+    assert "outside the volume" in refusal("ct", "render", bean_run, "--slices", "z=400")[0]
+    assert nerfcli("ct", "render", bean_run, "--slices", "w=1").exit_code == 2
 
 
 @pytest.mark.parametrize("suffix", [".nrrd", ".mha", ".nii", ".tif"])
 def test_info_reads_reconstructions_and_their_volumes(bean_run: Path, tmp_path: Path, suffix: str) -> None:
-    code, out, err = call("info", bean_run, "--json")
-    assert code == 0, err
-    facts = json.loads(out)
+    facts = json.loads(completed("ct", "info", bean_run, "--json").stdout)
     assert (facts["kind"], facts["unit"]) == ("reconstruction", "mm")
     assert facts["decisions"] == list(load_reconstruction(bean_run).decisions)
     export_scan(bean_run, Output(tmp_path / f"bean{suffix}"))
-    code, out, err = call("info", tmp_path / f"bean{suffix}", "--json")
-    assert code == 0, err
-    facts = json.loads(out)
+    facts = json.loads(completed("ct", "info", tmp_path / f"bean{suffix}", "--json").stdout)
     assert (facts["kind"], facts["unit"], facts["quantity"]) == ("volume", "mm", "1/mm")
     assert facts["voxels"] == "x".join(str(count) for count in reversed(load_reconstruction(bean_run).grid.shape))
     assert facts["attenuation"].startswith("float32, ")
@@ -154,8 +130,8 @@ def test_info_reads_reconstructions_and_their_volumes(bean_run: Path, tmp_path: 
 def test_lists_of_runs_on_standard_input(bean_run: Path, tmp_path: Path) -> None:
     """Runs mixed with other paths: each run is processed, and a path that is no run is reported."""
     lines = f"{bean_run}\n{tmp_path}\n"
-    for arguments, suffix in ((("render",), ".tif"), (("export",), ".nrrd")):
-        result = CliRunner().invoke(app, ["ct", *arguments, "-", "-o", str(tmp_path / "out")], input=lines)
+    for command, suffix in (("render", ".tif"), ("export", ".nrrd")):
+        result = nerfcli("ct", command, "-", "-o", tmp_path / "out", stdin=lines)
         assert result.exit_code == 3, result.stderr
         assert f"Error: {tmp_path} is not a reconstruction" in result.stderr
         assert result.stdout.splitlines()
@@ -178,11 +154,10 @@ def test_residuals_are_those_of_the_open_beam_of_each_view(tmp_path: Path) -> No
     brighter = np.where(np.arange(30) % 2, 1.1, 1.0)[:, None, None]
     save_scan(tmp_path / "scan", replace(scan, values=(scan.values * brighter).astype(np.float32)))
     fixed = ("--passes", "4", "--centre", "0", "--tilt", "0")
-    assert call("train", tmp_path / "scan", *fixed, "--air", "measured")[0] == 0
+    completed("ct", "train", tmp_path / "scan", *fixed, "--air", "measured")
     for views in ("test", "train"):
-        code, out, err = call("render", tmp_path / "scan-run", "--cameras", views, "--outputs", "residual")
-        assert code == 0, err
-        beside = np.array([tifffile.imread(path)[:, :3] for path in out.splitlines()])
+        rendered = completed("ct", "render", tmp_path / "scan-run", "--cameras", views, "--outputs", "residual")
+        beside = np.array([tifffile.imread(path)[:, :3] for path in rendered.stdout.splitlines()])
         assert np.abs(beside.mean(axis=(1, 2))).max() < 1.0
 
 
@@ -201,12 +176,11 @@ def test_a_scan_without_held_out_views_is_evaluated(tmp_path: Path) -> None:
 def test_resume_goes_on_from_the_volume(bean_run: Path, tmp_path: Path) -> None:
     scan, run = bean_run.with_name("bean"), tmp_path / "run"
     fixed = ("--centre", "0", "--tilt", "0", "--tv", "1", "-o", run)
-    assert call("train", scan, "--passes", "2", *fixed)[0] == 0
+    completed("ct", "train", scan, "--passes", "2", *fixed)
     assert load_reconstruction(run).passes == 2
     decisions = load_reconstruction(run).decisions
     assert any("model error" in sentence for sentence in decisions)
-    code, _, err = call("train", scan, "--passes", "5", "--resume", *fixed)
-    assert code == 0, err
+    completed("ct", "train", scan, "--passes", "5", "--resume", *fixed)
     assert load_reconstruction(run).passes == 5
     assert load_reconstruction(run).decisions == decisions
     before = (run / "reconstruction.json").read_bytes()
@@ -215,8 +189,8 @@ def test_resume_goes_on_from_the_volume(bean_run: Path, tmp_path: Path) -> None:
         ("3", (), 0, "is kept: it has 5 passes in "),
         ("9", ("--tv", "2", "--centre", "1"), 3, "another reconstruction; it differs in --tv, --centre"),
     ):
-        found, _, err = call("train", scan, "--passes", passes, "--resume", *fixed, *others)
-        assert (found, words in err) == (code, True), err
+        found = nerfcli("ct", "train", scan, "--passes", passes, "--resume", *fixed, *others)
+        assert (found.exit_code, words in found.stderr) == (code, True), found.stderr
         assert (run / "reconstruction.json").read_bytes() == before
 
 
@@ -249,16 +223,13 @@ def test_an_interrupted_fit_is_not_complete_and_resume_goes_on_from_it(bean_run:
     assert notes == [f"{saved}; to continue, add --resume to the same command"]
 
     fixed = ("--centre", "0", "--tilt", "0", "--tv", "1", "--air", "stated")
-    command = ("train", scan, "--passes", "3", *fixed, "-o", run)
-    code, out, err = call(*command)
-    assert (code, out) == (3, "")
-    assert err.startswith(f"Error: {run} holds a fit that was interrupted after pass {interrupted.passes}\n")
-    code, out, err = call(*command, "--resume")
-    assert (code, out) == (0, f"{run}\n"), err
+    command = ("ct", "train", scan, "--passes", "3", *fixed, "-o", run)
+    assert refusal(*command)[0] == f"Error: {run} holds a fit that was interrupted after pass {interrupted.passes}"
+    assert completed(*command, "--resume").stdout == f"{run}\n"
     result = load_reconstruction(run)
     assert (result.passes, result.complete) == (3, True)
     assert result.seconds > interrupted.seconds
-    assert "is kept: it is complete" in call(*command)[2]
+    assert "is kept: it is complete" in completed(*command).stderr
 
 
 def test_an_interrupt_between_fit_and_save_waits(
@@ -278,12 +249,12 @@ def test_an_interrupt_between_fit_and_save_waits(
 def test_a_damaged_run_is_trained_again_as_the_hint_says(bean_run: Path, tmp_path: Path) -> None:
     run = shutil.copytree(bean_run, tmp_path / "run")
     (run / "marks.npy").unlink()
-    again = ("train", bean_run.with_name("bean"), "-o", run, "--passes", "1", "--voxel-size", "3", "--centre", "0")
-    code, _, err = call(*again)
-    assert code == 3
-    assert f"Error: {run} cannot be read as a reconstruction" in err
-    assert "Hint:  train the scan again with --overwrite" in err
-    assert call(*again, "--overwrite")[0] == 0
+    fixed = ("--passes", "1", "--voxel-size", "3", "--centre", "0")
+    again = ("ct", "train", bean_run.with_name("bean"), "-o", run, *fixed)
+    error, hint = refusal(*again)
+    assert error.startswith(f"Error: {run} cannot be read as a reconstruction")
+    assert hint.startswith("Hint:  train the scan again with --overwrite")
+    completed(*again, "--overwrite")
 
 
 def test_a_save_that_fails_leaves_the_earlier_run(bean_run: Path, tmp_path: Path) -> None:
@@ -299,15 +270,13 @@ def test_centre_is_where_doctor_says(tmp_path: Path) -> None:
     circle = phantom_circle(views=48, columns=48)
     scan = scan_of_phantom(replace(circle, column_shift=2.5), stated=circle, photons=3e4)
     save_scan(tmp_path / "scan", scan)
-    train = ("train", tmp_path / "scan", "--passes", "1", "--tilt", "0", "-o")
-    code, _, err = call(*train, tmp_path / "estimated")
-    assert code == 0, err
-    found = re.search(r"axis at column (\S+) ± \S+; the scan states (\S+)", err)
+    train = ("ct", "train", tmp_path / "scan", "--passes", "1", "--tilt", "0", "-o")
+    estimated = completed(*train, tmp_path / "estimated")
+    found = re.search(r"axis at column (\S+) ± \S+; the scan states (\S+)", estimated.stderr)
     assert found is not None
     column, stated = float(found[1]), float(found[2])
     assert (column, stated) == (pytest.approx(21.0, abs=0.1), 23.5)
-    code, _, err = call(*train, tmp_path / "set", "--centre", f"{column - stated:.2f}")
-    assert code == 0, err
+    completed(*train, tmp_path / "set", "--centre", f"{column - stated:.2f}")
     for run in ("estimated", "set"):
         used = load_reconstruction(tmp_path / run).used
         assert axis_column(scan.geometry.corrected(used["centre"], 0.0)) == pytest.approx(column, abs=0.006)
@@ -339,15 +308,14 @@ def test_pictures_that_are_there_are_kept_and_nothing_is_added(
     bean_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first: tuple[str, ...], more: tuple[str, ...]
 ) -> None:
     with monkeypatch.context() as patched:  # residuals alone need the noise of all views, several times their memory
-        patched.setattr("nerfcli.ct.render.likelihood_of", lambda *given: pytest.fail("the noise was judged"))
-        code, _, err = call("render", bean_run, "-o", tmp_path, *first)
-        assert code == 0, err
+        patched.setattr("nerfcli.ct.render.likelihood_of", lambda *given, **more: pytest.fail("it was judged"))
+        completed("ct", "render", bean_run, "-o", tmp_path, *first)
         before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
-        code, _, err = call("render", bean_run, "-o", tmp_path, *more)
-        assert code == 3
-    assert re.search(r"Error: \S+ exists\nHint:  add --overwrite to replace it", err)
+        error, hint = refusal("ct", "render", bean_run, "-o", tmp_path, *more)
+    assert re.fullmatch(r"Error: \S+ exists", error)
+    assert hint.startswith("Hint:  add --overwrite to replace it")
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
-    assert call("render", bean_run, "-o", tmp_path, *more, "--overwrite")[0] == 0
+    completed("ct", "render", bean_run, "-o", tmp_path, *more, "--overwrite")
 
 
 @pytest.mark.parametrize("suffix", [".nrrd", ".mha", ".nii", ".tif"])
@@ -385,7 +353,7 @@ def test_an_nrrd_states_its_place_and_unit(tmp_path: Path) -> None:
     assert fields["space origin"] == "(1,2,3)"
     assert fields["space units"] == '"mm" "mm" "mm"'
     assert gzip.decompress(body) == values.tobytes()
-    facts = json.loads(call("info", tmp_path / "a.nrrd", "--json")[1])
+    facts = json.loads(completed("ct", "info", tmp_path / "a.nrrd", "--json").stdout)
     assert (facts["voxels"], facts["last_centre"]) == ("5x4x3", [3.0, 3.5, 4.0])
 
 
@@ -402,16 +370,15 @@ def test_hounsfield_units_of_water_and_air(tmp_path: Path, bean_run: Path) -> No
 def test_the_format_and_the_attenuation_of_water_are_used_and_checked(bean_run: Path, tmp_path: Path) -> None:
     run = tmp_path / "bean-run"
     shutil.copytree(bean_run, run)
-    code, out, err = call("export", run, "--format", "mha")
-    assert code == 0, err
-    assert Path(out.split()[0]) == tmp_path / "bean-run-volume.mha"
+    exported = completed("ct", "export", run, "--format", "mha")
+    assert Path(exported.stdout.split()[0]) == tmp_path / "bean-run-volume.mha"
     for options in (
         ("--format", "obj"),
         ("--format", "mha", "-o", tmp_path / "a.nii"),
         ("--water", "0"),
         ("--water", "nan"),
     ):
-        assert call("export", run, "--overwrite", *options)[0] == 2
+        assert nerfcli("ct", "export", run, "--overwrite", *options).exit_code == 2
 
 
 def test_export_from_inside_a_run_replaces_the_volume_and_its_marks(
@@ -423,8 +390,7 @@ def test_export_from_inside_a_run_replaces_the_volume_and_its_marks(
     paths = [str(tmp_path / f"bean-run-volume{end}.nrrd") for end in ("", "-marks")]
     for value, written in ((4, paths), (0, paths[:1])):
         save_reconstruction(run, replace(result, marks=np.full_like(result.marks, value)))
-        code, out, err = call("export", ".", "--overwrite")
-        assert (code, out.splitlines()) == (0, written), err
+        assert completed("ct", "export", ".", "--overwrite").stdout.splitlines() == written
         assert sorted(map(str, tmp_path.glob("*.nrrd"))) == sorted(written)
 
 
@@ -449,10 +415,9 @@ def test_other_suffixes_and_types_are_refused(tmp_path: Path) -> None:
     ],
 )
 def test_train_refuses_in_two_lines(bean_run: Path, tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
-    code, _, err = call("train", bean_run.with_name("bean"), "--passes", "1", "-o", tmp_path / "run", *arguments)
-    assert code == (OUT_OF_MEMORY if "memory" in said else BAD_INPUT)
-    assert re.search(said, err)
-    assert len([line for line in err.strip().splitlines() if line.strip()]) <= 3
+    train = ("ct", "train", bean_run.with_name("bean"), "--passes", "1", "-o", tmp_path / "run", *arguments)
+    error, _ = refusal(*train, exit_code=OUT_OF_MEMORY if "memory" in said else BAD_INPUT)
+    assert re.search(said, error)
 
 
 def test_more_voxels_than_64_bits_can_count() -> None:
@@ -467,34 +432,25 @@ def test_metrics_that_cannot_be_written_are_refused_before_they_are_measured(
     (run / "metrics.json").unlink(missing_ok=True)
     monkeypatch.setattr("nerfcli.atomic.os.access", lambda path, mode: False)
     monkeypatch.setattr("nerfcli.ct.evaluate.scan_of", lambda result, run: pytest.fail("it was read"))
-    code, _, err = call("evaluate", run)
-    assert (code, err.splitlines()[0]) == (3, f"Error: cannot write {run / 'metrics.json'}: no write permission")
+    assert refusal("ct", "evaluate", run)[0] == f"Error: cannot write {run / 'metrics.json'}: no write permission"
 
 
 def test_few_views_and_columns_are_refused_or_checked(tmp_path: Path) -> None:
     """Regression: tracebacks, of a scan whose views are nearly all held out, and of one cropped to a few columns."""
     scan = scan_of(cone(9, rows=2, columns=4), held_out=tuple(range(7)))
     save_scan(tmp_path / "scan", scan)
-    code, _, err = call("train", tmp_path / "scan", "--passes", "1")
-    assert code == 3
-    assert err.startswith(
-        f"Error: {tmp_path / 'scan'} has 2 views with usable pixels that are not held out, expected 3\n"
-    )
-    assert "with fewer views held out" in err
+    error, hint = refusal("ct", "train", tmp_path / "scan", "--passes", "1")
+    assert error == f"Error: {tmp_path / 'scan'} has 2 views with usable pixels that are not held out, expected 3"
+    assert "with fewer views held out" in hint
     save_scan(tmp_path / "few", scan_of(cone(2, rows=2, columns=4)))
-    assert (
-        "Hint:  a reconstruction needs more views of the object" in call("train", tmp_path / "few", "--passes", "1")[2]
-    )
     usable = np.ones((9, 1, 1), bool)
     usable[2:] = False
     save_scan(tmp_path / "empty", replace(scan_of(cone(9, rows=2, columns=4)), usable=usable))
-    assert (
-        "Hint:  a reconstruction needs more views of the object"
-        in call("train", tmp_path / "empty", "--passes", "1")[2]
-    )
+    for name in ("few", "empty"):
+        _, hint = refusal("ct", "train", tmp_path / name, "--passes", "1")
+        assert hint.startswith("Hint:  a reconstruction needs more views of the object")
     assert not (tmp_path / "scan-run").exists()
-    code, out, err = call("doctor", tmp_path / "scan")
-    assert (code, out) == (0, f"{tmp_path / 'scan-doctor.html'}\n"), err
+    assert completed("ct", "doctor", tmp_path / "scan").stdout == f"{tmp_path / 'scan-doctor.html'}\n"
 
 
 def test_a_changed_scan_is_not_evaluated_as_the_old_one(bean_run: Path, tmp_path: Path) -> None:

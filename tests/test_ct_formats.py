@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import error_of, nerfcli
+from commands import completed, error_of, nerfcli
 from scan_files import WRITERS, Written, nikon, stack
 
 from nerfcli.ct.formats.assemble import axis_column
@@ -62,8 +62,7 @@ def test_points_are_seen_where_the_formula_of_the_format_says(form: str, tmp_pat
 def test_what_a_format_states_is_found_in_what_was_stored(form: str, tmp_path: Path) -> None:
     """Round trip: convert, read the folder, and recover a circle from its vectors by other formulas."""
     written = WRITERS[form](tmp_path)
-    result = nerfcli("ct", "convert", written.path, tmp_path / "out", "--json")
-    assert result.exit_code == 0, result.stderr
+    result = completed("ct", "convert", written.path, tmp_path / "out", "--json")
     stored = load_scan(tmp_path / "out")
     stated = read_scan(written.path)
     np.testing.assert_allclose(stored.geometry.vectors(), stated.geometry.vectors(), rtol=0, atol=1e-12)

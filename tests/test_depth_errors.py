@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from commands import nerfcli
+from commands import completed, nerfcli
 
 from nerfcli.captures.formats.run_cameras import RunCameras
 from nerfcli.errors import UserError
@@ -143,8 +143,7 @@ def test_a_run_without_held_out_photos_has_no_intervals(spheres_run):
 def test_render_writes_the_interval_and_keeps_the_errors(copied, tmp_path, monkeypatch):
     monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth())
     common = ("render", copied, "--depth", "median", "--depth-axis", "ray", "--threads", "2")
-    result = nerfcli(*common, "--outputs", "depth,coverage,lower,upper", "-o", tmp_path / "views")
-    assert result.exit_code == 0, result.stderr
+    completed(*common, "--outputs", "depth,coverage,lower,upper", "-o", tmp_path / "views")
     depth, coverage, lower, upper, truth = (
         np.stack([tifffile.imread(path) for path in sorted(paths)])
         for paths in (
@@ -165,8 +164,7 @@ def test_render_writes_the_interval_and_keeps_the_errors(copied, tmp_path, monke
     assert "lower end of the 90 % interval of depth along the ray" in nerfcli("info", path).stdout
     # The errors are read, not measured again.
     monkeypatch.setattr(depth_errors, "dense_depths", pytest.fail)
-    exr = nerfcli(*common, "--outputs", "lower,upper", "--depth-format", "exr", "-o", tmp_path / "other")
-    assert exr.exit_code == 0, exr.stderr
+    completed(*common, "--outputs", "lower,upper", "--depth-format", "exr", "-o", tmp_path / "other")
     assert json.loads((copied / DEPTH_ERRORS).read_text())["photos"] == 3
 
 
@@ -176,8 +174,7 @@ def test_render_writes_the_proportion_of_depths_within_the_tolerance(copied, tmp
     common = ("render", copied, "--depth", "median", "--depth-axis", "ray", "--threads", "2")
     common += ("--depth-format", "tiff,exr")
     outputs = ("--outputs", "depth,coverage,confidence", "-o", tmp_path / "views")
-    result = nerfcli(*common, *outputs)
-    assert result.exit_code == 0, result.stderr
+    completed(*common, *outputs)
     depth, coverage, confidence, truth = (
         np.stack([tifffile.imread(path) for path in sorted(paths)])
         for paths in (
@@ -206,8 +203,7 @@ def test_render_writes_the_proportion_of_depths_within_the_tolerance(copied, tmp
 
 def test_render_says_where_there_is_no_interval(copied, tmp_path, monkeypatch):
     monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth(0.01))
-    result = nerfcli("render", copied, "--outputs", "lower", "--threads", "2", "-o", tmp_path / "views")
-    assert result.exit_code == 0, result.stderr
+    result = completed("render", copied, "--outputs", "lower", "--threads", "2", "-o", tmp_path / "views")
     assert "no intervals or confidence where 4 photos see the surface: " in result.stderr
     assert "pixels were measured, and 200 are needed, in 2 held-out photos" in result.stderr
     assert "what cannot be matched is usually worse" in result.stderr

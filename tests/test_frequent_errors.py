@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from commands import error_of, listing, nerfcli, refusal
+from commands import completed, error_of, listing, nerfcli, refusal
 from every_format import WITH_PHOTOS, Views
 from test_odd_inputs import CAMERA, POSES, photos
 
@@ -72,8 +72,7 @@ def test_the_folder_of_photos_in_a_capture_is_given(tmp_path):
 def test_a_folder_or_file_of_the_model_is_given(given, tmp_path):
     """The photos above it are found."""
     one = project(tmp_path / "one")
-    result = nerfcli("convert", one / given, tmp_path / "out.json", "--to", "transforms", "--allow-loss")
-    assert result.exit_code == 0, result.stderr
+    result = completed("convert", one / given, tmp_path / "out.json", "--to", "transforms", "--allow-loss")
     assert "missing" not in result.stderr
 
 

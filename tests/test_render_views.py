@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import error_of, nerfcli
+from commands import completed, error_of, nerfcli
 from PIL import Image
 
 from nerfcli.render.files.float_maps import read_tiff
@@ -17,8 +17,7 @@ ONE = ("--cameras", "orbit", "--count", "2", "--threads", "1")
 
 
 def rendered(run: Path, *options: str | Path, outputs: str = "rgb") -> Path:
-    result = nerfcli("render", run, *ONE, "--outputs", outputs, *options)
-    assert result.exit_code == 0, result.stderr
+    result = completed("render", run, *ONE, "--outputs", outputs, *options)
     return Path(result.stdout.splitlines()[0])
 
 
@@ -68,8 +67,7 @@ def test_pixels_without_a_ray_are_invalid(finished):
 
 
 def test_a_fisheye_that_sees_behind_has_no_z_there_and_says_so(finished):
-    result = nerfcli("render", finished, *ONE, "--lens", "fisheye", "--fov", "200", "--width", "16", "--height", "16")
-    assert result.exit_code == 0
+    result = completed("render", finished, *ONE, "--lens", "fisheye", "--fov", "200", "--width", "16", "--height", "16")
     assert "have no z (NaN)" in result.stderr
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from commands import error_of, nerfcli
+from commands import completed, error_of, nerfcli
 from fog import fog, foggy_cells
 
 from nerfcli.cameras.camera import Camera
@@ -356,8 +356,7 @@ def sides_of(run: Path, points: np.ndarray) -> np.ndarray:
 def test_a_mesh_is_written_in_the_frame_of_the_scene(blocked, tmp_path):
     scale = Run(blocked).model().training_from_scene.scale
     for form in ("ply", "glb", "obj"):
-        result = nerfcli("export", blocked, "--to", "mesh", *small(scale, 0.06), "-o", tmp_path / f"a.{form}")
-        assert result.exit_code == 0, result.stderr
+        result = completed("export", blocked, "--to", "mesh", *small(scale, 0.06), "-o", tmp_path / f"a.{form}")
         assert result.stdout.strip() == str(tmp_path / f"a.{form}")
     vertices, _ = vertices_of(tmp_path / "a.ply")
     assert len(vertices) > 200
@@ -383,8 +382,7 @@ def vertices_of(path: Path) -> tuple[np.ndarray, int]:
 
 def test_points_are_written(blocked, tmp_path):
     scale = Run(blocked).model().training_from_scene.scale
-    result = nerfcli("export", blocked, "--to", "points", *small(scale, 0.05), "-o", tmp_path / "p.ply")
-    assert result.exit_code == 0, result.stderr
+    completed("export", blocked, "--to", "points", *small(scale, 0.05), "-o", tmp_path / "p.ply")
     places, _ = vertices_of(tmp_path / "p.ply")
     assert np.abs(sides_of(blocked, places) - 0.5).max() < 0.02
     facts = describe(tmp_path / "p.ply")
@@ -408,8 +406,7 @@ def test_what_cannot_be_exported_is_refused_in_two_lines(blocked, tmp_path):
 
 def test_exports_stand_beside_the_run_under_its_name(blocked):
     scale = Run(blocked).model().training_from_scene.scale
-    result = nerfcli("export", blocked, "--to", "points", "--quiet", *small(scale, 0.25))
-    assert result.exit_code == 0, result.stderr
+    result = completed("export", blocked, "--to", "points", "--quiet", *small(scale, 0.25))
     assert result.stderr == ""
     assert Path(result.stdout.strip()) == blocked.with_name("spheres-run-points.ply")
     size = SurfaceSettings(voxel_size=0.25 / scale, max_size=48)
