@@ -40,11 +40,6 @@ def folder_name(views: Views, settings: RenderSettings, *, of_splats: bool = Fal
     return f"{views.name}{depth}{'-splats' if of_splats else ''}"
 
 
-def usual_settings(run: Run, views: Views) -> RenderSettings:
-    """Return the settings of colours, depths and opacities, as `nerfcli render` writes them by default."""
-    return RenderSettings(outputs=OUTPUTS[:3], depth=usual_depth(run, views))
-
-
 def render_run(
     run: str | Path,
     output: Output = Output(),
@@ -66,7 +61,7 @@ def render_run(
         run: the folder that `train_scene` wrote.
         output: the folder to write; in RUN/renders by default, named after views and depth.
         views: which cameras; the held-out ones by default.
-        settings: outputs, depth, file formats, videos, and steps along rays; `usual_settings` by default.
+        settings: outputs, depth, file formats, videos, and steps along rays; colours, depths and opacities by default.
         splats: a .ply or .spz to render instead of the field.
         resources: threads and device.
         reporter: receives messages, and the fraction of the rays that is done.
@@ -78,7 +73,7 @@ def render_run(
         UserError: the run or the cameras do not exist, or the output holds other files.
     """
     trained, torch_device = load_run(run), resources.torch_device
-    settings = usual_settings(trained, views) if settings is None else settings
+    settings = settings or RenderSettings(outputs=OUTPUTS[:3], depth=usual_depth(trained, views))
     folder = output.at(trained.path / RENDERS / folder_name(views, settings, of_splats=splats is not None))
     resources.begin()
     model = trained.model(torch_device)
