@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import apply
 from nerfcli.errors import UserError
 from nerfcli.matching.stereo import LONGER_SIDE_PX, dense_depths
 from nerfcli.matching.tracks import Tracks
@@ -93,4 +94,4 @@ def _median_points(model: Model, frame: Frame, pixels: np.ndarray) -> tuple[np.n
     column, row = (pixels * size // (frame.camera.width, frame.camera.height)).T
     median = picture.depth[row, column].astype(np.float64)
     rays, _ = frame.camera.bearings(pixels + 0.5)
-    return (rays * median[:, None]) @ frame.world_from_cam[:3, :3].T + frame.centre, median
+    return apply(frame.world_from_cam, rays * median[:, None]), median

@@ -8,7 +8,7 @@ import torch
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.rigid import from_parts, rotation_from_vector
+from nerfcli.cameras.rigid import apply, from_parts, rotation_from_vector
 from nerfcli.photos.colours import to_8_bit
 from nerfcli.photos.loading import pinhole_of
 from nerfcli.render.coverage import DepthMap, normals_of_points
@@ -47,8 +47,7 @@ class DepthView:
 
     def points(self) -> np.ndarray:
         """Return the points (H, W, 3) in the scene's frame; NaN where there is no depth."""
-        pose = self.frame.world_from_cam
-        return (plane_rays(self.frame.camera) * self.depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+        return apply(self.frame.world_from_cam, plane_rays(self.frame.camera) * self.depth[..., None])
 
     def distances(self) -> DepthMap:
         """Return the depths as distances along the rays."""

@@ -18,6 +18,7 @@ import torch
 from scipy.ndimage import minimum_filter
 from torch import Tensor
 
+from nerfcli.cameras.rigid import apply
 from nerfcli.export.depth_views import DepthView, plane_rays
 from nerfcli.export.extent import Grid
 from nerfcli.photos.colours import to_8_bit
@@ -100,12 +101,11 @@ def _blocks_near(views: Sequence[DepthView], grid: Grid) -> np.ndarray:
     near = np.zeros(counts, dtype=bool)
     reach = TRUNCATION * grid.voxel_size
     for view in views:
-        pose = view.frame.world_from_cam
-        rays = plane_rays(view.frame.camera)[pixel_weights(view, grid.voxel_size) > 0]
-        depth = view.depth[pixel_weights(view, grid.voxel_size) > 0][:, None]
+        used = pixel_weights(view, grid.voxel_size) > 0
+        rays, depth = plane_rays(view.frame.camera)[used], view.depth[used][:, None]
         lengths = np.linalg.norm(rays, axis=-1, keepdims=True)
         for off in np.linspace(-reach, reach, 5):
-            points = (rays * (depth + off / lengths)) @ pose[:3, :3].T + pose[:3, 3]
+            points = apply(view.frame.world_from_cam, rays * (depth + off / lengths))
             blocks = np.floor((points - grid.low) / (SIDE * grid.voxel_size)).astype(np.int64)
             blocks = blocks[((blocks >= 0) & (blocks < counts)).all(-1)]
             near[tuple(blocks.T)] = True

@@ -8,6 +8,7 @@ import torch
 from torch.nn.functional import normalize
 
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import apply
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import RenderedPicture, render_picture
@@ -67,8 +68,7 @@ class DepthMap:
         """Return the points (N, 3) of the surface in the scene's frame, row by row, without pixels that see none."""
         rays, _ = self.frame.camera.pixel_bearings()
         there = np.isfinite(self.distances.ravel())
-        pose = self.frame.world_from_cam
-        return (rays[there] * self.distances.ravel()[there, None]) @ pose[:3, :3].T + pose[:3, 3]
+        return apply(self.frame.world_from_cam, rays[there] * self.distances.ravel()[there, None])
 
 
 def depth_maps(
@@ -191,8 +191,7 @@ def with_coverage(
     if axis == "z":
         ahead = rays[:, 2] > 0
         rays = rays / np.where(ahead, rays[:, 2], 1.0)[:, None]
-    pose = frame.world_from_cam
-    points = (rays * picture.median.reshape(-1, 1)) @ pose[:3, :3].T + pose[:3, 3]
+    points = apply(frame.world_from_cam, rays * picture.median.reshape(-1, 1))
     coverage, parallax = coverage_and_parallax(photo_depths, points)
     shape = picture.median.shape
     return replace(picture, coverage=coverage.reshape(shape), parallax=parallax.reshape(shape))
