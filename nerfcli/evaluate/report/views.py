@@ -144,8 +144,6 @@ def spread_evenly(names: Sequence[str], count: int, *, quality: dict[str, float]
     """
     if len(names) <= count:
         return list(names)
-    if count == 0:
-        return []
     ranked = sorted(names, key=lambda name: quality[name]) if all(name in quality for name in names) else list(names)
     ranks = np.rint(np.linspace(0, len(ranked) - 1, count)).astype(int)
     chosen = {ranked[rank] for rank in ranks}
