@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nerfcli.cli import options
 from nerfcli.cli.batch import Given, for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.convert import place_of
 from nerfcli.cli.doctor import GATES, Gate, check_gate, show_findings
 from nerfcli.cli.info import show_facts
-from nerfcli.cli.options import Json, Overwrite, Printing, Writing, holdout_rule, one_of
+from nerfcli.cli.options import Json, Overwrite, Printing, Threads, Writing, holdout_rule, one_of, seconds_from_text
 from nerfcli.ct.recognise import OWN, recognise
 from nerfcli.errors import UserError, in_shell
 from nerfcli.machine import thread_count
@@ -226,10 +225,10 @@ class FitOptions:
         """
         from nerfcli.ct.result import ReconstructionSettings
 
-        options.one_of(self.air, _AIR, "--air")
+        one_of(self.air, _AIR, "--air")
         budget = self.budget or (DEFAULT_BUDGET if self.passes is None else None)
         return ReconstructionSettings(
-            budget_seconds=None if budget is None else options.seconds_from_text(budget),
+            budget_seconds=None if budget is None else seconds_from_text(budget),
             passes=self.passes,
             voxel_size=self.voxel_size,
             strength=self.tv,
@@ -246,10 +245,10 @@ def train(
         str, typer.Argument(help="Scan folder that nerfcli ct convert wrote, or - to read paths from standard input.")
     ],
     *,
-    writing: options.Writing,
+    writing: Writing,
     fit: FitOptions,
-    threads: options.Threads = 0,
-    printing: options.Printing,
+    threads: Threads = 0,
+    printing: Printing,
 ) -> None:
     """Fit a volume to a scan.
 

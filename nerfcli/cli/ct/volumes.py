@@ -5,10 +5,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from nerfcli.cli import options
 from nerfcli.cli.batch import Given, for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Overwrite, Printing, Threads, Writing, finite, one_of
+from nerfcli.cli.options import Overwrite, Printing, Threads, Writing, finite, one_of, some_of
 from nerfcli.ct.recognise import VOLUMES
 from nerfcli.machine import Resources
 from nerfcli.output import Output, beside
@@ -16,12 +15,14 @@ from nerfcli.output import Output, beside
 if TYPE_CHECKING:
     from nerfcli.ct.evaluate import ScanEvaluation
 
+RunFolder = Annotated[
+    str, typer.Argument(help="Run folder that nerfcli ct train wrote, or - to read paths from standard input.")
+]
+
 
 @command
 def evaluate(
-    run: Annotated[
-        str, typer.Argument(help="Run folder that nerfcli ct train wrote, or - to read paths from standard input.")
-    ],
+    run: RunFolder,
     *,
     reference: Annotated[
         Path | None,
@@ -86,9 +87,7 @@ def _cells(scores: dict[str, Any] | None, digits: dict[str, int]) -> list[str]:
 
 @command
 def render(
-    run: Annotated[
-        str, typer.Argument(help="Run folder that nerfcli ct train wrote, or - to read paths from standard input.")
-    ],
+    run: RunFolder,
     *,
     cameras: Annotated[str, typer.Option(help="Views: test, the held-out ones, or train.")] = "test",
     outputs: Annotated[
@@ -98,9 +97,9 @@ def render(
         list[str] | None,
         typer.Option(help="Slices instead of views: z=0.3, a position in the unit of the scan. Repeatable."),
     ] = None,
-    writing: options.Writing,
-    threads: options.Threads = 0,
-    printing: options.Printing,
+    writing: Writing,
+    threads: Threads = 0,
+    printing: Printing,
 ) -> None:
     """Render projections of a reconstruction, or slices through it.
 
@@ -114,8 +113,8 @@ def render(
     """
     from nerfcli.ct.render import OUTPUTS, render_scan
 
-    chosen = options.some_of(outputs, OUTPUTS, "--outputs")
-    options.one_of(cameras, ("test", "train"), "--cameras")
+    chosen = some_of(outputs, OUTPUTS, "--outputs")
+    one_of(cameras, ("test", "train"), "--cameras")
     cuts = tuple(map(_slice_of, slices or ()))
     console, resources = printing.console, Resources(threads)
 
@@ -143,9 +142,7 @@ def _slice_of(text: str) -> tuple[str, float]:
 
 @command
 def export(
-    run: Annotated[
-        str, typer.Argument(help="Run folder that nerfcli ct train wrote, or - to read paths from standard input.")
-    ],
+    run: RunFolder,
     *,
     writing: Writing,
     form: Annotated[
