@@ -212,7 +212,7 @@ def test_photos_are_only_taken_from_the_folder_that_the_user_gives(write, listed
     photos(tmp_path, numbered("edited/{}.png"))
     (tmp_path / "edited/0.png").unlink()
     write(tmp_path / "capture", numbered(listed.format(folder=tmp_path)))
-    images = [frame.image for frame in parsed(tmp_path / "capture", images=tmp_path / "edited").frames]
+    images = [frame.image for frame in parse(tmp_path / "capture", UserInputs(images=tmp_path / "edited")).frames]
     assert [path for path in images if path and path.is_file()] == [
         tmp_path / "edited" / f"{i}.png" for i in range(1, COUNT)
     ]

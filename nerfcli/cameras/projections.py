@@ -20,19 +20,15 @@ class Projection(Protocol):
 
     def sees(self, directions: np.ndarray) -> np.ndarray:
         """Return whether directions (3, N) of any length are in the domain; (N,) bool."""
-        ...
 
     def plane(self, directions: np.ndarray) -> np.ndarray:
         """Project unit directions (3, N) onto the plane, (2, N)."""
-        ...
 
     def directions(self, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Invert `plane`: return unit directions (3, N), and whether each exists, (N,) bool."""
-        ...
 
     def jacobian(self, directions: np.ndarray) -> np.ndarray:
         """Return d plane / d direction at unit directions, (2, 3, N)."""
-        ...
 
     def parameter_jacobian(self, directions: np.ndarray) -> np.ndarray:
         """Return d plane / d parameters in the order of the class's fields, (2, parameters, N)."""

@@ -89,11 +89,9 @@ class Medium(Protocol):
 
     def density(self, coordinates: Tensor) -> Tensor:
         """Return the density (N,), in 1 / training unit, at coordinates (N, 3) of the unit cube."""
-        ...
 
     def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
         """Return density (N,) and sRGB colour (N, 3) at coordinates (N, 3) along `directions` (R, 3) of `rays` (N,)."""
-        ...
 
 
 class Targets(NamedTuple):

@@ -217,22 +217,18 @@ class Renderable(Protocol):
     @property
     def background(self) -> Background:
         """SRGB behind everything, for pictures without alpha."""
-        ...
 
     @property
     def unit(self) -> str:
         """Unit of length, "arbitrary" or "metre"."""
-        ...
 
     @property
     def unit_source(self) -> str | None:
         """How the metre is known; None where unknown."""
-        ...
 
     @property
     def thread_safe(self) -> bool:
         """Whether several threads may render it at the same time."""
-        ...
 
     def render(
         self,
@@ -243,8 +239,6 @@ class Renderable(Protocol):
         on_tile: Callable[[int], None] | None = None,
     ) -> RenderedPicture:
         """Render a frame; see `render_picture`."""
-        ...
 
     def measured_error(self, frame: Frame, *, depth: DepthRequest | None) -> dict[str, float]:
         """Return numbers on the accuracy of the rendering; see `accuracy`."""
-        ...

@@ -26,27 +26,21 @@ class PageData(Protocol):
 
     def page(self) -> str:
         """Return the HTML of the page; browsers retry after a UserError, as when there is no field yet."""
-        ...
 
     def field(self) -> bytes:
         """Return the parameters of the newest field, with a description."""
-        ...
 
     def proof(self) -> bytes:
         """Return reference pictures of the newest field."""
-        ...
 
     def photo(self, index: int, longest_px: int) -> bytes:
         """Return the JPEG of a photo; raise LookupError if there is none."""
-        ...
 
     def picture(self, client: str, view: Any) -> Iterator[bytes]:
         """Yield the parts of a picture, see `Painter.paint`; raise ValueError for an invalid view."""
-        ...
 
     def version(self) -> int:
         """Return the version number of the newest field, 0 if there is none yet."""
-        ...
 
 
 # Only this machine can reach it.
