@@ -27,6 +27,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.captures.axes import pose_in_axes
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import write_colmap_binary, write_colmap_text
+from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.lenses import Fits, Terms
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.formats.ply import write_points

@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 
 from nerfcli.captures.capture import Capture
 from nerfcli.cli import app
-from nerfcli.cli.options import FieldMemory
 from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import KINDS, chosen_size, parameter_bytes
@@ -52,8 +51,8 @@ def test_the_size_of_a_field_is_that_which_it_gets(kind: str) -> None:
 
 
 def test_help_states_the_sizes_of_a_hash_grid() -> None:
-    text = FieldMemory.__metadata__[0].help
-    stated = re.search(r"hash (\d+) to (\d+)MiB", text)
+    text = CliRunner().invoke(app, ["train", "--help"]).stdout
+    stated = re.search(r"hash\s+(\d+)\s+to\s+(\d+)MiB", text)
     assert stated is not None, text
     usual = TrainSettings(budget_seconds=1.0, threads=2)
     sizes = (usual, replace(usual, budget_seconds=120.0), replace(usual, budget_seconds=3600.0))

@@ -70,8 +70,8 @@ class Fit:
     contraction: Annotated[
         str,
         typer.Option(
-            help="Map distant space into a ball (l2), or not at all (none); auto: l2, but none for photos with alpha or "
-            "of an object before a plain background."
+            help="Map distant space into a ball (l2), or not at all (none); auto: l2, but none for photos with alpha "
+            "or of an object before a plain background."
         ),
     ] = "auto"
     log2_rows: Annotated[
