@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerfcli.errors import UserError
+from nerfcli.notices import Reporter
 from nerfcli.poses.input.pairs import capture_order
 from nerfcli.poses.input.video_frames import (
     FRAMES_FILE,
@@ -37,14 +38,8 @@ def extract(path: Path, folder: Path, *, count: int | None = None, overwrite: bo
     """Extract frames and return the notes."""
     notes: list[str] = []
     fractions: list[float] = []
-    extract_frames(
-        path,
-        folder,
-        count=count,
-        overwrite=overwrite,
-        notify=notes.append,
-        progress=lambda fraction, what: fractions.append(fraction),
-    )
+    reporter = Reporter(note=notes.append, progress=lambda fraction, what: fractions.append(fraction))
+    extract_frames(path, folder, count=count, overwrite=overwrite, reporter=reporter)
     assert fractions == sorted(fractions)
     return notes
 

@@ -107,9 +107,7 @@ def _with_frames(
     is_file = wanted.form.default_name and target.suffix == Path(wanted.form.default_name).suffix
     folder = frames_folder(target.with_suffix("") if is_file else target)
     with reporter.stage(f"extract frames of {video.name}") as stage:
-        extract_frames(
-            video, folder, count=None, overwrite=wanted.overwrite, notify=stage.note, progress=stage.progress
-        )
+        extract_frames(video, folder, count=None, overwrite=wanted.overwrite, reporter=stage)
     return replace(given, images=folder)
 
 

@@ -68,14 +68,7 @@ def estimate_poses(
     elif source.is_file():
         refuse_odd_names(folder, ())
         with reporter.stage(f"extract frames of {source.name}") as stage:
-            extract_frames(
-                source,
-                folder,
-                count=frames,
-                overwrite=output.overwrite,
-                notify=stage.note,
-                progress=stage.progress,
-            )
+            extract_frames(source, folder, count=frames, overwrite=output.overwrite, reporter=stage)
     elif frames is not None:
         reporter.note(f"{source} is not a video: using all of its photos and ignoring --frames")
     calibration = _given_intrinsics(intrinsics, folder)

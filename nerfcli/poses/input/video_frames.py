@@ -20,6 +20,7 @@ from PIL import Image
 import nerfcli
 from nerfcli.atomic import atomic_folder, write_json
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
+from nerfcli.notices import Notify, Reporter
 from nerfcli.photos.images import downscale
 from nerfcli.photos.video import MeasuredFrames, Video, measure_frames, open_video, read_frames
 from nerfcli.poses.input.photos import MIN_PHOTOS
@@ -158,8 +159,7 @@ def extract_frames(
     *,
     count: int | None,
     overwrite: bool,
-    notify: Callable[[str], None],
-    progress: Callable[[float, str], None],
+    reporter: Reporter = Reporter(),
 ) -> None:
     """Write the sharpest frames of a video to `folder`, or keep them if they are there already.
 
@@ -171,7 +171,6 @@ def extract_frames(
         folder: gets frame_000123.jpg... and frames.json, all or nothing.
         count: how many; None for 120. A video with fewer frames gives all of them.
         overwrite: replace frames that were made from another video or with another count.
-        progress: receives (fraction done in 0...1, current step).
 
     Raises:
         UserError: the video cannot be read or is cut short, or shows fewer than four different pictures; or `folder`
@@ -179,32 +178,25 @@ def extract_frames(
     """
     video = open_video(path)
     request = {"video": _identity(path), "frames": count, "selection": 1}
-    if _kept(folder, path, request, overwrite=overwrite, notify=notify):
+    note = reporter.note
+    if _kept(folder, path, request, overwrite=overwrite, note=note):
         return
     if video.num_streams > 1:
-        notify(f"{path.name} has {video.num_streams} video streams: the largest, {video.width}x{video.height}, is used")
+        note(f"{path.name} has {video.num_streams} video streams: the largest, {video.width}x{video.height}, is used")
     if video.hdr:
-        notify(f"{path.name} is an HDR video: its colours are converted to sRGB")
+        note(f"{path.name} is an HDR video: its colours are converted to sRGB")
     # Measuring takes most of the time, since it also examines every frame; extracting only decodes.
-    video, measured = _measured(video, lambda fraction: progress(0.7 * fraction, "looking for sharp frames"))
+    video, measured = _measured(video, reporter.part(0.0, 0.7, "looking for sharp frames"))
     if video.fields:
-        notify(f"{path.name} is interlaced: the lines of the later field of each frame are interpolated")
+        note(f"{path.name} is interlaced: the lines of the later field of each frame are interpolated")
     if measured.errors:
-        notify(f"{path.name} is damaged in {measured.errors} places; nearby frames may show block artifacts")
+        note(f"{path.name} is damaged in {measured.errors} places; nearby frames may show block artifacts")
     total = len(measured.values)
     if count is not None and count > total:
-        notify(f"{path.name} has only {total} frames, but --frames is {count}: using all of them")
+        note(f"{path.name} has only {total} frames, but --frames is {count}: using all of them")
     numbers = choose_frames(measured.seconds, measured.values, count=min(count or DEFAULT_FRAMES, total))
-    step = smallest_step(measured.values)
     with atomic_folder(folder) as partial:
-        frames = _write(
-            partial,
-            video,
-            numbers,
-            measured,
-            step,
-            lambda fraction: progress(0.7 + 0.3 * fraction, "writing frames"),
-        )
+        frames = _write(partial, video, numbers, measured, reporter.part(0.7, 1.0, "writing frames"))
         if len(frames) < MIN_PHOTOS:
             raise UserError(
                 f"{path} has only {len(frames)} different frames; at least {MIN_PHOTOS} are needed",
@@ -218,7 +210,7 @@ def extract_frames(
             "frames_in_video": total,
             "frames": frames,
             "settings": {
-                "moved_share": step,
+                "moved_share": smallest_step(measured.values),
                 "sharpness_size_px": SHARPNESS_SIZE_PX,
                 "jpeg_quality": _JPEG_QUALITY,
             },
@@ -226,10 +218,8 @@ def extract_frames(
         }
         write_json(partial / FRAMES_FILE, content)
     same = len(numbers) - len(frames)
-    notify(
-        f"{folder}: {len(frames)} of {total} frames of {path.name}"
-        + (f"; {same} more are duplicates of the previous frame" if same else "")
-    )
+    duplicates = f"; {same} more are duplicates of the previous frame" if same else ""
+    note(f"{folder}: {len(frames)} of {total} frames of {path.name}{duplicates}")
 
 
 def _measured(video: Video, progress: Callable[[float], None]) -> tuple[Video, MeasuredFrames[FrameMeasure]]:
@@ -245,7 +235,6 @@ def _write(
     video: Video,
     numbers: Sequence[int],
     measured: MeasuredFrames[FrameMeasure],
-    step: float,
     progress: Callable[[float], None],
 ) -> list[dict[str, Any]]:
     """Write the chosen frames that differ from the one written before; of similar frames, the sharpest one.
@@ -254,7 +243,7 @@ def _write(
     """
     written: list[dict[str, Any]] = []
     chosen = zip(numbers, read_frames(video, numbers), strict=True)
-    for number, picture in _different(chosen, measured.values, step=step):
+    for number, picture in _different(chosen, measured.values):
         name = f"frame_{number:06d}.jpg"
         Image.fromarray(picture).save(folder / name, quality=_JPEG_QUALITY, subsampling=0)
         seconds, sharp = float(measured.seconds[number]), measured.values[number].sharpness
@@ -264,9 +253,10 @@ def _write(
 
 
 def _different(
-    frames: Iterator[tuple[int, np.ndarray]], measures: Sequence[FrameMeasure], *, step: float
+    frames: Iterator[tuple[int, np.ndarray]], measures: Sequence[FrameMeasure]
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the frames without repetitions: of a run of frames that show the same, only the sharpest."""
+    step = smallest_step(measures)
     best: tuple[int, np.ndarray] | None = None
     first: MotionPicture | None = None
     for number, picture in frames:
@@ -282,7 +272,7 @@ def _different(
         yield best
 
 
-def _kept(folder: Path, path: Path, request: dict[str, Any], *, overwrite: bool, notify: Callable[[str], None]) -> bool:
+def _kept(folder: Path, path: Path, request: dict[str, Any], *, overwrite: bool, note: Notify) -> bool:
     """Return whether `folder` already holds the requested frames.
 
     Raises:
@@ -300,7 +290,7 @@ def _kept(folder: Path, path: Path, request: dict[str, Any], *, overwrite: bool,
     missing = sum(not (folder / name).is_file() for name in names)
     if same and not (missing and overwrite):
         left = f", {missing} of which are missing" if missing else ""
-        notify(f"{folder} is kept: {len(names)} frames{left}")
+        note(f"{folder} is kept: {len(names)} frames{left}")
         return True
     if not overwrite:
         raise UserError(
