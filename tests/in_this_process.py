@@ -38,10 +38,4 @@ def worker_in_this_process() -> Iterator[None]:
 def poses_in_this_process(photos: Path, scene: Path, settings: PoseSettings) -> PosesReport:
     """Estimate poses without messages and progress."""
     with worker_in_this_process():
-        return structure_from_motion.estimate_poses(
-            photos,
-            scene,
-            settings=settings,
-            notify=lambda note: None,
-            progress=lambda stage, done, total: None,
-        )
+        return structure_from_motion.estimate_poses(photos, scene, settings=settings)

@@ -53,7 +53,6 @@ def test_poses_of_dark_photos_agree_with_the_truth(tmp_path: Path):
             photos,
             tmp_path / "scene",
             settings=SETTINGS,
-            notify=lambda note: None,
             progress=lambda stage, done, total: reported.update({stage: (done, total)}),
         )
     assert report.registered == 5

@@ -149,7 +149,7 @@ def test_a_folder_without_masks_is_reported_before_the_work(photos, masks):
     """In a dry run, too."""
 
     def plan(folder: Path) -> None:
-        plan_poses(photos.folder, settings=PoseSettings(masks=str(folder)), progress=lambda *reported: None)
+        plan_poses(photos.folder, settings=PoseSettings(masks=str(folder)))
 
     with pytest.raises(UserError, match="contains no mask for any photo") as error:
         plan(masks)

@@ -244,14 +244,14 @@ def test_pairs_with_few_common_features_are_left_out_where_both_photos_have_bett
 # The plan
 
 
-def plan_of(pairing: Pairing, *, threads: int = 1, settings: PoseSettings = PoseSettings()) -> Plan:
-    return make_plan(Photos(Path("x"), tuple(lettered(100)), {}), pairing, settings, threads=threads)
+def plan_of(pairing: Pairing, *, photos: int = 100, threads: int = 1, features: int = 4096) -> Plan:
+    settings = PoseSettings(threads=threads, max_features=features)
+    return make_plan(Photos(Path("x"), tuple(lettered(photos)), {}), pairing, settings)
 
 
 def test_the_estimate_falls_with_threads_and_features():
     pairing = choose_pairs(lettered(100), rule="exhaustive")
-    alone = plan_of(pairing, settings=PoseSettings(max_features=40))
-    many = plan_of(pairing, threads=4, settings=PoseSettings(max_features=20))
+    alone, many = plan_of(pairing, features=40), plan_of(pairing, threads=4, features=20)
     assert alone.pairs == 4950
     assert many.seconds["match"] == pytest.approx(alone.seconds["match"] / 8, abs=0.1)
 
@@ -261,8 +261,7 @@ def test_small_photos_are_not_planned_with_as_many_features_as_large_ones():
     photos = lettered(100)
     pixels = photos[0].width * photos[0].height
     assert plan_of(choose_pairs(photos, rule="exhaustive")).features == round(0.015 * pixels) < 4096
-    wanted = PoseSettings(max_features=30)
-    assert plan_of(choose_pairs(photos, rule="exhaustive"), settings=wanted).features == 30
+    assert plan_of(choose_pairs(photos, rule="exhaustive"), features=30).features == 30
 
 
 def test_look_alikes_bound_the_number_of_pairs():
@@ -273,9 +272,7 @@ def test_look_alikes_bound_the_number_of_pairs():
 @pytest.mark.parametrize(("photos", "seconds"), [(100, 1.5), (1000, 37.5), (5000, 234.3)])
 def test_looking_for_similar_photos_stays_affordable(photos: int, seconds: float):
     """Closed form: 0.3 ms a pair with 256 features, a quarter of that with half as many."""
-    plan = make_plan(
-        Photos(Path("x"), tuple(lettered(photos)), {}), Pairing("retrieval", (), 25), PoseSettings(), threads=1
-    )
+    plan = plan_of(Pairing("retrieval", (), 25), photos=photos)
     assert plan.seconds["pair"] == pytest.approx(seconds, abs=0.1)
 
 

@@ -8,7 +8,7 @@ import json
 import math
 import shutil
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -205,18 +205,10 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def estimate(
-    photos: Path,
-    scene: Path,
-    settings: PoseSettings = ONE_THREAD,
-    *,
-    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
-    memory_bytes: int | None = None,
+    photos: Path, scene: Path, settings: PoseSettings = ONE_THREAD, **options: Any
 ) -> tuple[PosesReport, list[str]]:
     notes: list[str] = []
-    report = estimate_poses(
-        photos, scene, settings=settings, notify=notes.append, progress=progress, memory_bytes=memory_bytes
-    )
-    return report, notes
+    return estimate_poses(photos, scene, settings=settings, notify=notes.append, **options), notes
 
 
 class EndedError(Exception):

@@ -5,9 +5,9 @@ The capture is the room corner of `corner`, whose cameras are known: 450 px at 4
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -37,13 +37,9 @@ ONE_THREAD = PoseSettings(max_features=200, max_image_size=256, threads=1)
 TRUE = Camera("OPENCV", 960, 720, (2 * FOCAL_PX, 2 * FOCAL_PX, 480, 360, 0, 0, 0, 0))
 
 
-def estimate(
-    photos: Path, scene: Path, given: Calibration | None, notify: Callable[[str], None] = lambda note: None
-) -> PosesReport:
+def estimate(photos: Path, scene: Path, **options: Any) -> PosesReport:
     with worker_in_this_process():
-        return estimate_poses(
-            photos, scene, settings=ONE_THREAD, notify=notify, progress=lambda *reported: None, given=given
-        )
+        return estimate_poses(photos, scene, settings=ONE_THREAD, **options)
 
 
 def worst_centre(scene: Path) -> float:
@@ -66,7 +62,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def unaided(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scene of a call without intrinsics."""
     scene = tmp_path_factory.mktemp("unaided") / "scene"
-    estimate(photos, scene, None)
+    estimate(photos, scene)
     return scene
 
 
@@ -77,7 +73,7 @@ def test_fixed_intrinsics_stay_to_the_last_bit_and_only_mapping_is_done_again(
     scene, notes = shutil.copytree(unaided, tmp_path / "scene"), []
     given = Calibration(tmp_path / "cameras.txt", (TRUE,), {})
     assert not is_same_scene(scene, photos, ONE_THREAD, given=given)
-    report = estimate(photos, scene, given, notes.append)
+    report = estimate(photos, scene, given=given, notify=notes.append)
     for table, key in (("descriptors", "image_id"), ("matches", "pair_id")):
         assert rows(scene, table, key) == rows(unaided, table, key)
     assert model(scene) != model(unaided)

@@ -18,6 +18,7 @@ from dataclasses import replace
 from errno import ENOSPC
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 import pytest
@@ -45,17 +46,8 @@ class KilledError(Exception):
     """The worker was killed."""
 
 
-def estimate(
-    photos: Path,
-    scene: Path,
-    settings: PoseSettings = ONE_THREAD,
-    *,
-    progress: Progress = lambda *reported: None,
-    memory_bytes: int | None = None,
-) -> PosesReport:
-    return estimate_poses(
-        photos, scene, settings=settings, notify=lambda n: None, progress=progress, memory_bytes=memory_bytes
-    )
+def estimate(photos: Path, scene: Path, settings: PoseSettings = ONE_THREAD, **options: Any) -> PosesReport:
+    return estimate_poses(photos, scene, settings=settings, **options)
 
 
 def killed_at(stage: str, done: int) -> Progress:
@@ -394,9 +386,9 @@ def test_memory_of_this_process_and_machine_is_measured():
 
 def test_planning_writes_nothing(photos: Path):
     before = sorted(path.name for path in photos.parent.iterdir())
-    _, _, pairing, plan = plan_poses(photos, settings=ONE_THREAD, progress=lambda *reported: None)
-    assert (plan.photos, plan.rule, plan.pairs) == (8, "retrieval", 28)
-    assert len(pairing.pairs) == 28
+    prepared = plan_poses(photos, settings=ONE_THREAD)
+    assert (prepared.plan.photos, prepared.plan.rule, prepared.plan.pairs) == (8, "retrieval", 28)
+    assert len(prepared.pairing.pairs) == 28
     assert sorted(path.name for path in photos.parent.iterdir()) == before
 
 

@@ -3,9 +3,9 @@
 import json
 import signal
 import subprocess
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pycolmap
@@ -157,12 +157,6 @@ def write_noise(folder: Path) -> None:
         Image.fromarray(wall(100 + seed)[:160, :160]).save(folder / f"{seed}.png")
 
 
-def estimate(photos: Path, scene_dir: Path, progress: Callable[[str, int, int], None] | None = None) -> PosesReport:
-    return estimate_poses(
-        photos, scene_dir, settings=FAST, notify=lambda note: None, progress=progress or (lambda *reported: None)
-    )
-
-
 def test_photos_without_overlap_are_too_few_and_leave_no_scene(tmp_path: Path):
     write_noise(tmp_path / "photos")
     reported: list[str] = []
@@ -199,7 +193,7 @@ def test_an_interrupt_ends_the_worker_and_leaves_no_scene(tmp_path: Path, monkey
     monkeypatch.setattr(subprocess, "Popen", Recorded)
     write_noise(tmp_path / "photos")
     with pytest.raises(KeyboardInterrupt):
-        estimate(tmp_path / "photos", tmp_path / "scene", interrupt)
+        estimate_poses(tmp_path / "photos", tmp_path / "scene", settings=FAST, progress=interrupt)
     assert [worker.returncode for worker in workers] == [-9]
     assert not (tmp_path / "scene" / "scene.json").exists()
 
@@ -238,7 +232,7 @@ def test_a_scene_never_takes_the_place_of_the_photos(tmp_path: Path):
     write_noise(tmp_path / "photos")
     for destination in (tmp_path / "photos", tmp_path):
         with pytest.raises(UserError, match="would overwrite the photos"):
-            estimate(tmp_path / "photos", destination)
+            estimate_poses(tmp_path / "photos", destination, settings=FAST)
     assert len(list((tmp_path / "photos").iterdir())) == 5
 
 
@@ -246,11 +240,11 @@ def test_a_folder_that_cannot_be_written_is_refused_before_photos_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     write_noise(tmp_path / "photos")
-    stages: list[str] = []
     monkeypatch.setattr("nerfcli.atomic.os.access", lambda path, mode: False)
     with pytest.raises(UserError, match="no write permission"):
-        estimate(tmp_path / "photos", tmp_path / "scene", lambda stage, done, total: stages.append(stage))
-    assert stages == []
+        estimate_poses(
+            tmp_path / "photos", tmp_path / "scene", settings=FAST, progress=Mock(side_effect=AssertionError)
+        )
 
 
 def test_a_folder_that_is_no_scene_is_not_replaced(tmp_path: Path):
@@ -258,7 +252,7 @@ def test_a_folder_that_is_no_scene_is_not_replaced(tmp_path: Path):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
     with pytest.raises(UserError, match="the folder contains other files"):
-        estimate(tmp_path / "photos", tmp_path / "thesis")
+        estimate_poses(tmp_path / "photos", tmp_path / "thesis", settings=FAST)
     assert (tmp_path / "thesis" / "chapter.tex").is_file()
 
 
@@ -272,6 +266,4 @@ def test_a_folder_that_is_no_scene_is_not_replaced(tmp_path: Path):
 )
 def test_settings_out_of_range_are_refused(tmp_path: Path, settings: PoseSettings, words: str):
     with pytest.raises(ValueError, match=words):
-        estimate_poses(
-            tmp_path, tmp_path / "scene", settings=settings, notify=lambda note: None, progress=lambda *reported: None
-        )
+        estimate_poses(tmp_path, tmp_path / "scene", settings=settings)

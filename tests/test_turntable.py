@@ -251,7 +251,7 @@ def solved(photos: Path, scene_dir: Path, **options: Any) -> tuple[dict, list[st
     notes: list[str] = []
     settings = replace(SETTINGS, **options)
     with worker_in_this_process():
-        estimate_poses(photos, scene_dir, settings=settings, notify=notes.append, progress=lambda *reported: None)
+        estimate_poses(photos, scene_dir, settings=settings, notify=notes.append)
     return json.loads((scene_dir / "poses_report.json").read_text(encoding="utf-8")), notes
 
 

@@ -7,7 +7,7 @@ upright copies of photos that are stored rotated.
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from nerfcli.errors import UserError, several
 from nerfcli.poses.engine.strict import move_held_out_last
 from nerfcli.poses.engine.supervise import WorkerDiedError, run_worker
 from nerfcli.poses.engine.turntable import MASKS, add_advice
-from nerfcli.poses.input.job import Job, write_job
+from nerfcli.poses.input.job import Job, Report, Tell, write_job
 from nerfcli.poses.input.layout import find_masks, lay_out_masks, lay_out_photos
 from nerfcli.poses.input.pairs import Pairing, choose_pairs, read_pairs
 from nerfcli.poses.input.photos import Photos, find_photos
@@ -45,8 +45,8 @@ def estimate_poses(
     scene_dir: Path,
     *,
     settings: PoseSettings,
-    notify: Callable[[str], None],
-    progress: Callable[[str, int, int], None],
+    notify: Tell = lambda note: None,
+    progress: Report = lambda stage, done, total: None,
     memory_bytes: int | None = None,
     planned: Callable[[Plan], None] = lambda plan: None,
     given: Calibration | None = None,
@@ -75,21 +75,20 @@ def estimate_poses(
     """
     start = time.perf_counter()
     check_destination(scene_dir, photos_dir, subfolders=settings.subfolders)
-    photos, grouped, pairing, plan = plan_poses(photos_dir, settings=settings, progress=progress, given=given)
-    for note in photo_notes(photos, grouped):
+    prepared = plan_poses(photos_dir, settings=settings, progress=progress, given=given)
+    for note in prepared.notes():
         notify(note)
-    planned(plan)
+    planned(prepared.plan)
     work, hashes = scene_dir / "work", hash_inputs(photos_dir, settings)
     with workspace(scene_dir) as lock:
-        job = _lay_out(
-            photos, _search_settings(settings, grouped), grouped=grouped, pairing=pairing, work=work, notify=notify
-        )
+        job = _lay_out(prepared, work, notify)
         solve = partial(run_worker, progress=progress, memory_bytes=memory_bytes, lock=lock, notify=notify)
         _run(job, work, solve, notify)
         result = read_json(work / "result.json")["content"]  # written by the worker, or complete from before
         result["seconds"]["total"] = round(time.perf_counter() - start, 3)
-        matching = {"rule": pairing.rule, "pairs": result["pairs"], **hashes}
-        report = make_report(photos, settings, result=result, matching=matching, intrinsics=grouped.given)
+        matching = {"rule": prepared.pairing.rule, "pairs": result["pairs"], **hashes}
+        intrinsics = prepared.grouped.given
+        report = make_report(prepared.photos, settings, result=result, matching=matching, intrinsics=intrinsics)
         if error := refusal(report, photos_dir):
             if not (settings.accept_refused and report.models):
                 raise _refused(add_advice(error, report.moving_foreground), report, scene_dir)
@@ -104,13 +103,39 @@ def estimate_poses(
     return report
 
 
+@dataclass(frozen=True)
+class PreparedPhotos:
+    """What is known before the work: the photos, their cameras, the pairs to match, and the plan.
+
+    settings: those of the search for features, which are others for panoramas.
+    """
+
+    photos: Photos
+    grouped: PhotoGroups
+    pairing: Pairing
+    settings: PoseSettings
+    plan: Plan
+
+    def notes(self) -> list[str]:
+        """List the skipped files with reasons, and notes on the pages and cameras of the other photos."""
+        photos = self.photos
+        notes = [f"{name} is skipped: {why}" for name, why in photos.unreadable.items()]
+        if photos.skipped:
+            notes.append(f"other files, not used: {photos.skipped}")
+        paged = [photo for photo in photos.photos if photo.exif.pages > 1]
+        if paged:
+            first = f"{paged[0].name}, {paged[0].width}x{paged[0].height}"
+            notes.append(f"{several(len(paged), 'file')} with several pages: the largest is used, such as {first}")
+        return [*notes, *self.grouped.notes]
+
+
 def plan_poses(
     photos_dir: Path,
     *,
     settings: PoseSettings,
-    progress: Callable[[str, int, int], None],
+    progress: Report = lambda stage, done, total: None,
     given: Calibration | None = None,
-) -> tuple[Photos, PhotoGroups, Pairing, Plan]:
+) -> PreparedPhotos:
     """Read the photos, choose cameras and pairs, and estimate how long the work will take; nothing is written.
 
     Raises:
@@ -126,27 +151,12 @@ def plan_poses(
         pairing = choose_pairs(photos.photos, rule=settings.pairing)
     else:
         pairing = read_pairs(Path(settings.pairs_file), photos)
-    plan = make_plan(photos, pairing, _search_settings(settings, grouped), threads=settings.cores)
-    return photos, grouped, pairing, plan
+    if any(group.is_panorama for group in grouped.groups):
+        settings = for_panoramas(settings)
+    return PreparedPhotos(photos, grouped, pairing, settings, make_plan(photos, pairing, settings))
 
 
-def _search_settings(settings: PoseSettings, grouped: PhotoGroups) -> PoseSettings:
-    return for_panoramas(settings) if any(group.is_panorama for group in grouped.groups) else settings
-
-
-def photo_notes(photos: Photos, grouped: PhotoGroups) -> list[str]:
-    """List the skipped files with reasons, and notes on the pages and cameras of the other photos."""
-    notes = [f"{name} is skipped: {why}" for name, why in photos.unreadable.items()]
-    if photos.skipped:
-        notes.append(f"other files, not used: {photos.skipped}")
-    paged = [photo for photo in photos.photos if photo.exif.pages > 1]
-    if paged:
-        first = f"{paged[0].name}, {paged[0].width}x{paged[0].height}"
-        notes.append(f"{several(len(paged), 'file')} with several pages: the largest is used, such as {first}")
-    return [*notes, *grouped.notes]
-
-
-def _run(job: Job, work: Path, solve: Callable[..., None], notify: Callable[[str], None]) -> None:
+def _run(job: Job, work: Path, solve: Callable[..., None], notify: Tell) -> None:
     """Run the worker; if a check ends it, run it again without that check, since the model is on disk by then."""
     while True:
         (work / UNDERWAY).unlink(missing_ok=True)
@@ -161,16 +171,9 @@ def _run(job: Job, work: Path, solve: Callable[..., None], notify: Callable[[str
             job = replace(job, skipped_checks=(*job.skipped_checks, (error.check, error.message)))
 
 
-def _lay_out(
-    photos: Photos,
-    settings: PoseSettings,
-    *,
-    grouped: PhotoGroups,
-    pairing: Pairing,
-    work: Path,
-    notify: Callable[[str], None],
-) -> Job:
+def _lay_out(prepared: PreparedPhotos, work: Path, notify: Tell) -> Job:
     """Lay out the photos and masks for the worker."""
+    photos, settings, pairing = prepared.photos, prepared.settings, prepared.pairing
     laid_out = lay_out_photos(photos, work)
     files = tuple(photo.file for photo in laid_out)
     masks = Path(settings.masks) if settings.masks else None
@@ -181,7 +184,7 @@ def _lay_out(
         originals=str(photos.folder.absolute()),
         names=photos.names,
         keys=tuple(photo.key for photo in laid_out),
-        groups=grouped.groups,
+        groups=prepared.grouped.groups,
         pairs=pairing.pairs,
         neighbours=pairing.neighbours,
         max_image_size=settings.max_image_size,

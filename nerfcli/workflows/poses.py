@@ -15,7 +15,7 @@ from nerfcli.poses.input.photos import refuse_odd_names
 from nerfcli.poses.input.plan import STAGES, Plan, TimeEstimate
 from nerfcli.poses.input.settings import PoseSettings, check_settings
 from nerfcli.poses.input.video_frames import extract_frames, frames_folder
-from nerfcli.poses.structure_from_motion import photo_notes, plan_poses
+from nerfcli.poses.structure_from_motion import plan_poses
 from nerfcli.poses.workspace import check_destination, is_same_scene
 
 
@@ -142,15 +142,15 @@ def plan_scene(
     Raises:
         UserError: see `plan_poses`.
     """
-    photos, grouped, _, plan = plan_poses(
+    prepared = plan_poses(
         folder,
         settings=settings,
         progress=lambda stage, done, total: reporter.progress(done / max(total, 1), STAGES[stage].counted),
         given=_given_intrinsics(intrinsics, folder),
     )
-    for note in photo_notes(photos, grouped):
+    for note in prepared.notes():
         reporter.note(note)
-    return plan
+    return prepared.plan
 
 
 def without_suffix(source: Path) -> Path:

@@ -80,9 +80,9 @@ class Plan:
         return f"{self.photos} photos, {self.pairs} pairs to match ({self.rule}), {about}: {times}; {memory}"
 
 
-def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threads: int) -> Plan:
-    """Return the plan for these photos; threads is the actual number, not -1."""
-    count = len(photos.photos)
+def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings) -> Plan:
+    """Return the plan for these photos."""
+    count, threads = len(photos.photos), settings.cores
     all_pairs = count * (count - 1) // 2
     pairs = min(len(pairing.pairs) + pairing.neighbours * count, all_pairs)
     sizes = [(photo.width, photo.height) for photo in photos.photos]
