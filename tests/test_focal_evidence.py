@@ -194,4 +194,4 @@ def test_crops_of_other_pictures_are_other_cameras_and_autofocus_is_not():
         photo(str(n), exif, size=(640, 640))
         for n, exif in enumerate((a, b, replace(a, focal_mm=50.6), replace(a, focal_mm=52.0)))
     ]
-    assert camera_groups(photos) == (("0", "2"), ("1",), ("3",))
+    assert camera_groups(photos) == ((0, 2), (1,), (3,))

@@ -133,8 +133,7 @@ def test_photos_share_a_camera_when_all_optics_and_the_size_agree():
         photo("7", NO_EXIF),
         photo("8", NO_EXIF, size=(128, 96)),
     ]
-    groups = camera_groups(photos)
-    assert groups == (("1", "3"), ("2", "7"), ("4",), ("5",), ("6",), ("8",))
+    assert camera_groups(photos) == ((0, 2), (1, 6), (3,), (4,), (5,), (7,))
 
 
 @pytest.mark.parametrize(

@@ -9,12 +9,7 @@ from pathlib import Path, PurePosixPath
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError, several
 from nerfcli.photos.exif import Exif, read_exif
 from nerfcli.photos.focal_evidence import focal_evidence, same_focal, with_digital_zoom
-from nerfcli.photos.images import (
-    list_photos,
-    name_in,
-    read_image,
-    where_photos_may_be,
-)
+from nerfcli.photos.images import list_photos, name_in, read_image, where_photos_may_be
 from nerfcli.photos.panoramas import is_panorama
 
 # Three views determine a scene up to scale, but leave nothing to check them with; four are the fewest that do.
@@ -102,28 +97,23 @@ def refuse_odd_names(folder: Path, paths: Iterable[Path]) -> None:
             raise UserError(f"the name {name!r} is not in UTF-8", "rename it; old archives have such names")
 
 
-def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
-    """Group photos that may share intrinsics: same subfolder, make, model, lens, focal length, upright size and crop.
+def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[int, ...], ...]:
+    """Group the numbers of photos that may share intrinsics.
 
-    Focal lengths within 2 % count as the same: autofocus changes them a little. Photos without EXIF are distinguished
-    by their size alone. Groups and the names in them are in the order of `photos`.
+    They have the same subfolder, make, model, lens, focal length, upright size and crop. Focal lengths within 2 % count
+    as the same: autofocus changes them a little. Photos without EXIF are distinguished by their size alone. Groups and
+    the numbers in them are in the order of `photos`.
     """
-    groups: dict[tuple[object, ...], list[str]] = {}
+    groups: dict[tuple[object, ...], list[int]] = {}
     focals: list[float] = []
-    for photo in photos:
+    for number, photo in enumerate(photos):
         exif = photo.exif
         evidence = focal_evidence(exif)
         crop = evidence.whole_px if evidence.doubt else None
-        optics = (
-            exif.make,
-            exif.model,
-            exif.lens,
-            same_focal(exif.focal_mm, focals),
-            same_focal(exif.focal_35mm, focals),
-        )
-        key = (PurePosixPath(photo.name).parent, *optics, crop, photo.width, photo.height)
-        groups.setdefault(key, []).append(photo.name)
-    return tuple(tuple(names) for names in groups.values())
+        zoom = same_focal(exif.focal_mm, focals), same_focal(exif.focal_35mm, focals)
+        optics = (exif.make, exif.model, exif.lens, *zoom, crop, photo.width, photo.height)
+        groups.setdefault((PurePosixPath(photo.name).parent, *optics), []).append(number)
+    return tuple(tuple(numbers) for numbers in groups.values())
 
 
 def _examine(path: Path, name: str) -> Photo | str:

@@ -36,21 +36,20 @@ def group_photos(photos: Photos, *, model: str) -> PhotoGroups:
     Raises:
         UserError: a photo that is to be a panorama is not twice as wide as high.
     """
-    numbers = {name: number for number, name in enumerate(photos.names)}
     groups: list[CameraGroup] = []
     doubted: dict[str, list[str]] = {}
-    for names in camera_groups(photos.photos):
-        first = photos.photos[numbers[names[0]]]
-        members = [photos.photos[numbers[name]] for name in names]
+    for numbers in camera_groups(photos.photos):
+        members = [photos.photos[number] for number in numbers]
+        first = members[0]
         if model == PANORAMA or (model == "auto" and _are_panoramas(members)):
-            groups.append(_panoramas(tuple(numbers[name] for name in names), first))
+            groups.append(_panoramas(numbers, first))
             continue
         evidence = focal_evidence(first.exif)
         if evidence.doubt and (first.exif.focal_mm or first.exif.focal_35mm):
-            doubted.setdefault(evidence.doubt, []).extend(names)
+            doubted.setdefault(evidence.doubt, []).extend(photo.name for photo in members)
         groups.append(
             CameraGroup(
-                photos=tuple(numbers[name] for name in names),
+                photos=numbers,
                 model=start_model(first.exif) if model == "auto" else model,
                 width=first.width,
                 height=first.height,
@@ -96,20 +95,13 @@ def group_by_given(photos: Photos, calibration: Calibration) -> PhotoGroups:
                 f"{calibration.path} has a spherical camera of {one.camera.width}x{one.camera.height} pixels",
                 "panoramas of the whole sphere are twice as wide as high",
             )
-    optics = {name: number for number, names in enumerate(camera_groups(photos.photos)) for name in names}
+    optics = {number: numbers[0] for numbers in camera_groups(photos.photos) for number in numbers}
     members: dict[tuple[Any, ...], list[int]] = {}
-    for number, (name, one) in enumerate(zip(photos.names, found, strict=True)):
-        key = (one.number, one.camera, one.by_name, None if one.by_name else optics[name])
+    for number, one in enumerate(found):
+        key = (one.number, one.camera, one.by_name, None if one.by_name else optics[number])
         members.setdefault(key, []).append(number)
     groups = tuple(
-        CameraGroup(
-            photos=tuple(numbers),
-            model=camera.model,
-            width=camera.width,
-            height=camera.height,
-            params=camera.params,
-            fixed=True,
-        )
+        CameraGroup(tuple(numbers), camera.model, camera.width, camera.height, params=camera.params, fixed=True)
         for (_, camera, *_), numbers in members.items()
     )
     described = [
