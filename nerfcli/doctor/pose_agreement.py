@@ -22,6 +22,7 @@ from nerfcli.errors import several
 from nerfcli.matching.agreement import agreement, rays_of
 from nerfcli.matching.graph import connected_groups
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding
+from nerfcli.poses.input.pairs import pairs_of_nearest
 from nerfcli.poses.model.reasons import FEW_MATCHES
 
 # Photos that look alike match at the wrong place, too. They have fewer matches than true neighbours, so the strongest
@@ -125,12 +126,7 @@ def poses_by_matches(photos: Sequence[PhotoFacts], errors: Sequence[PairError]) 
 
 def nearest_pairs(frames: Sequence[Frame]) -> set[tuple[int, int]]:
     """Return the pairs (i, j), i < j, of each camera with its nearest ones that look the same way."""
-    distances = _distances(frames)
-    pairs: set[tuple[int, int]] = set()
-    for index, row in enumerate(distances):
-        nearest = np.argsort(row, kind="stable")[:NEAREST]
-        pairs |= {(min(index, int(other)), max(index, int(other))) for other in nearest if np.isfinite(row[other])}
-    return pairs
+    return pairs_of_nearest(_distances(frames), NEAREST)
 
 
 def misplaced_groups(

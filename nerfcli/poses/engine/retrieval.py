@@ -16,7 +16,7 @@ import pycolmap
 
 from nerfcli.poses.engine.features import feature_keys
 from nerfcli.poses.input.job import Job, Report, read_stage, stage_key, write_stage
-from nerfcli.poses.input.pairs import in_blocks, retrieval_feature_count
+from nerfcli.poses.input.pairs import in_blocks, pairs_of_nearest, retrieval_feature_count
 
 # Ratio of the squared distances to the nearest and the second nearest: 0.8 of the distance, as in pycolmap.
 _RATIO = 0.64
@@ -45,7 +45,7 @@ def select_pairs(job: Job, report: Report) -> Job:
     if found is None:
         most = retrieval_feature_count(len(job.files))
         with pycolmap.Database.open(job.database) as database:
-            descriptors = [coarsest(database, image_id, most)[1] for image_id in job.image_ids]
+            descriptors = [_coarsest(database, image_id, most) for image_id in job.image_ids]
         common = likeness(descriptors, report)
         found = [*promising(common, job.pairs), *alike(common, job.neighbours, paired=job.pairs)]
         write_stage(path, key, found)
@@ -82,15 +82,11 @@ def likeness(descriptors: Sequence[np.ndarray], report: Report) -> np.ndarray:
 
 def alike(likeness: np.ndarray, count: int, *, paired: Collection[tuple[int, int]]) -> list[tuple[int, int]]:
     """Return the sorted pairs (i, j), i < j, of each photo and its `count` most similar ones that are not `paired`."""
-    likeness = likeness.astype(np.float64)
-    np.fill_diagonal(likeness, -np.inf)
+    distances = -likeness.astype(np.float64)
+    np.fill_diagonal(distances, np.inf)
     for i, j in paired:
-        likeness[i, j] = likeness[j, i] = -np.inf
-    pairs: set[tuple[int, int]] = set()
-    for i, row in enumerate(likeness):
-        best = np.argsort(-row, kind="stable")[:count]
-        pairs |= {(min(i, j), max(i, j)) for j in best.tolist() if row[j] > -np.inf}
-    return sorted(pairs)
+        distances[i, j] = distances[j, i] = np.inf
+    return sorted(pairs_of_nearest(distances, count))
 
 
 def promising(likeness: np.ndarray, pairs: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -119,11 +115,10 @@ def _clear_matches(distances: np.ndarray) -> np.ndarray:
     return (mutual & (first < _RATIO * distances.min(axis=2, keepdims=True))).sum(axis=(0, 2))
 
 
-def coarsest(database: pycolmap.Database, image_id: int, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels (N, 2) and descriptors (N, 128) of the largest-scale features of a photo, the largest first."""
+def _coarsest(database: pycolmap.Database, image_id: int, most: int) -> np.ndarray:
+    """Return the descriptors (N, 128) of the largest-scale features of a photo, the largest first."""
     if not database.num_keypoints_for_image(image_id):
-        return np.zeros((0, 2)), np.zeros((0, 128), np.uint8)
-    keypoints = database.read_keypoints(image_id)
-    a, b, c, d = keypoints[:, 2:6].T  # the affine shape, row by row
+        return np.zeros((0, 128), np.uint8)
+    a, b, c, d = database.read_keypoints(image_id)[:, 2:6].T  # the affine shape, row by row
     order = np.argsort(-np.abs(a * d - b * c), kind="stable")[:most]
-    return keypoints[order, :2].astype(np.float64), database.read_descriptors(image_id).data[order]
+    return database.read_descriptors(image_id).data[order]

@@ -76,7 +76,7 @@ def choose_pairs(photos: Sequence[Photo], *, rule: str = "auto") -> Pairing:
                 f"--pairing spatial: {len(without)} of {len(photos)} photos have no GPS position ({without[0]})",
                 "choose --pairing retrieval or auto",
             )
-        near = nearest_pairs(_positions(photos, located), _NEAREST)
+        near = pairs_of_nearest(_distances(photos, located), _NEAREST)
         return Pairing("spatial", in_blocks((located[i], located[j]) for i, j in near), _LOOP_NEIGHBOURS)
     raise ValueError(f"pairing must be one of {', '.join(PAIRINGS)}, got {rule}")
 
@@ -85,8 +85,7 @@ def _best_rule(photos: Sequence[Photo]) -> str:
     if len(photos) <= ALL_ALIKE_UP_TO:
         return "retrieval"
     if located := _located(photos):
-        places = _positions(photos, located)
-        radii = np.sort(np.linalg.norm(places[:, None] - places[None], axis=-1), axis=1)[:, _NEAREST]
+        radii = np.sort(_distances(photos, located), axis=1)[:, _NEAREST - 1]
         if np.median(radii) > _GPS_ERROR_METRES:
             return "spatial"
     return "retrieval" if order_of_capture(photos) is None else "sequential"
@@ -100,12 +99,10 @@ def sequential_pairs(order: Sequence[int]) -> tuple[tuple[int, int], ...]:
     return in_blocks({_rising(order[i], order[j]) for i, j in near})
 
 
-def nearest_pairs(places: np.ndarray, count: int) -> tuple[tuple[int, int], ...]:
-    """Pair each of the positions (N, 2) with the `count` nearest ones."""
-    distances = np.linalg.norm(places[:, None] - places[None], axis=-1)
-    np.fill_diagonal(distances, np.inf)
-    nearest = np.argsort(distances, axis=1, kind="stable")[:, : min(count, len(places) - 1)]
-    return in_blocks({_rising(i, j) for i, row in enumerate(nearest.tolist()) for j in row})
+def pairs_of_nearest(distances: np.ndarray, count: int) -> set[tuple[int, int]]:
+    """Pair each photo with the `count` nearest ones, by distances (N, N), infinite for pairs that are not wanted."""
+    nearest = np.argsort(distances, axis=1, kind="stable")[:, :count].tolist()
+    return {_rising(i, j) for i, row in enumerate(nearest) for j in row if np.isfinite(distances[i, j])}
 
 
 def all_pairs(count: int) -> tuple[tuple[int, int], ...]:
@@ -234,10 +231,13 @@ def _located(photos: Sequence[Photo]) -> list[int]:
     return located if len(located) >= _LEAST_LOCATED * len(photos) else []
 
 
-def _positions(photos: Sequence[Photo], located: Sequence[int]) -> np.ndarray:
-    """Return positions (N, 2), metres east and north. Heights are left out, since GPS measures them worst."""
-    places = [photos[number].exif.gps for number in located]
-    return east_north_up([(*place[:2], None) for place in places if place is not None])[:, :2]
+def _distances(photos: Sequence[Photo], located: Sequence[int]) -> np.ndarray:
+    """Return distances (N, N) on the ground in metres, since GPS measures heights worst; infinite on the diagonal."""
+    gps = [photos[number].exif.gps for number in located]
+    places = east_north_up([(*place[:2], None) for place in gps if place is not None])[:, :2]
+    distances = np.linalg.norm(places[:, None] - places[None], axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    return distances
 
 
 def _rising(i: int, j: int) -> tuple[int, int]:
