@@ -15,7 +15,8 @@ from test_masks import job_for
 from nerfcli.cameras.alignment import align
 from nerfcli.photos.exif import read_exif
 from nerfcli.poses.engine import features as searching
-from nerfcli.poses.engine.features import extract, feature_counts
+from nerfcli.poses.engine.database import feature_counts
+from nerfcli.poses.engine.features import extract
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.input.photos import Photo, Photos
 from nerfcli.poses.input.settings import PoseSettings

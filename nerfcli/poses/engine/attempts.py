@@ -16,8 +16,8 @@ import pycolmap
 
 from nerfcli.errors import duration
 from nerfcli.matching.graph import connected_groups
-from nerfcli.poses.engine.database import evidence, register_photos
-from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
+from nerfcli.poses.engine.database import feature_counts, register_photos
+from nerfcli.poses.engine.features import extract, match, start_matching
 from nerfcli.poses.engine.initial_lens import detect_fisheyes, estimate_focal_lengths
 from nerfcli.poses.engine.mapping import MappedModels, MapperOptions, map_photos, mapper_limit_seconds
 from nerfcli.poses.input.job import Job, Report, Tell
@@ -89,7 +89,7 @@ class MappingAttempts:
         self.photos = len(job.files)
         self.report = report
         self.tell = tell
-        self._with_features = sum(photo["features"] >= FEW_FEATURES for photo in evidence(job))
+        self._with_features = sum(count >= FEW_FEATURES for count in feature_counts(job))
         self.located_from: list[pycolmap.Reconstruction] = []  # the models whose other photos were tried one by one
         self._reported = 0
         self._announced = ""

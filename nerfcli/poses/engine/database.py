@@ -9,7 +9,7 @@ the locks of the other are dropped. So Python's is used only while pycolmap has 
 """
 
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -48,7 +48,7 @@ def register_photos(job: Job) -> None:
         for image_id in there.keys() & wanted.keys()
         if _verified_with(before[there[image_id][1]]) != _verified_with(cameras[wanted[image_id][1]])
     ]
-    forget_geometries(job, verified_otherwise)
+    _forget(job, verified_otherwise, "two_view_geometries")  # the matches are kept, and are verified again later
     with _edited(job) as database:
         for table in ("frame_data", "frames", "rig_sensors", "rigs", "images", "cameras", "pose_priors"):
             database.execute(f"DELETE FROM {table}")
@@ -88,17 +88,13 @@ def forget_features(job: Job, image_ids: Iterable[int]) -> None:
     _forget(job, image_ids, "keypoints", "descriptors", "matches", "two_view_geometries")
 
 
-def forget_geometries(job: Job, image_ids: Iterable[int]) -> None:
-    """Remove the verified matches of some photos; the matches themselves are kept, and are verified again later."""
-    _forget(job, image_ids, "two_view_geometries")
-
-
 def keep_geometries(job: Job, pairs: Iterable[tuple[int, int]]) -> None:
     """Remove the verified matches of all pairs but `pairs` (photo numbers), since the mapper uses all that it finds."""
     ids = job.image_ids
     wanted = {pycolmap.image_pair_to_pair_id(ids[i], ids[j]) for i, j in pairs}
     with _edited(job) as database:
-        _delete(database, "two_view_geometries", "pair_id", lambda pair_id: pair_id not in wanted)
+        database.create_function("is_wanted", 1, wanted.__contains__)
+        database.execute("DELETE FROM two_view_geometries WHERE NOT is_wanted(pair_id)")
 
 
 def clear_matches(job: Job, *tables: str) -> None:
@@ -140,11 +136,15 @@ def name_images(job: Job) -> None:
         database.executemany("UPDATE images SET name = ? WHERE image_id = ?", list(names))
 
 
+def feature_counts(job: Job) -> list[int]:
+    """Return the number of features of each photo."""
+    with pycolmap.Database.open(job.database) as database:
+        return [database.num_keypoints_for_image(image_id) for image_id in job.image_ids]
+
+
 def evidence(job: Job) -> list[dict[str, Any]]:
     """Return, per photo, its number of features, and the photo with which it has the most verified matches."""
-    with pycolmap.Database.open(job.database) as database:
-        features = [database.num_keypoints_for_image(image_id) for image_id in job.image_ids]
-    best: list[tuple[int, str | None]] = [(0, None)] * len(features)
+    best: list[tuple[int, str | None]] = [(0, None)] * len(job.files)
     for first, second, count in count_matches(job.database):
         i, j = job.numbers[first], job.numbers[second]
         for one, other in ((i, j), (j, i)):
@@ -152,7 +152,7 @@ def evidence(job: Job) -> list[dict[str, Any]]:
                 best[one] = (count, job.names[other])
     return [
         {"features": found, "best_matches": matches, "best_partner": partner}
-        for found, (matches, partner) in zip(features, best, strict=True)
+        for found, (matches, partner) in zip(feature_counts(job), best, strict=True)
     ]
 
 
@@ -172,17 +172,11 @@ def _forget(job: Job, image_ids: Iterable[int], *tables: str) -> None:
     if not photos:
         return
     with _edited(job) as database:
+        database.create_function("is_photo", 1, photos.__contains__)
+        database.create_function("has_photo", 1, lambda i: not photos.isdisjoint(pycolmap.pair_id_to_image_pair(i)))
         for table in tables:
-            if table in ("keypoints", "descriptors"):
-                _delete(database, table, "image_id", photos.__contains__)
-            else:
-                _delete(database, table, "pair_id", lambda i: not photos.isdisjoint(pycolmap.pair_id_to_image_pair(i)))
-
-
-def _delete(database: sqlite3.Connection, table: str, column: str, condition: Callable[[int], bool]) -> None:
-    """Delete the rows of a table whose key, an integer, meets a condition."""
-    keys = [row for row in database.execute(f"SELECT {column} FROM {table}") if condition(row[0])]
-    database.executemany(f"DELETE FROM {table} WHERE {column} = ?", keys)
+            condition = "is_photo(image_id)" if table in ("keypoints", "descriptors") else "has_photo(pair_id)"
+            database.execute(f"DELETE FROM {table} WHERE {condition}")
 
 
 @contextmanager

@@ -11,7 +11,13 @@ from pathlib import Path
 import pycolmap
 
 from nerfcli.errors import duration
-from nerfcli.poses.engine.database import clear_matches, forget_features, keep_geometries, register_photos
+from nerfcli.poses.engine.database import (
+    clear_matches,
+    feature_counts,
+    forget_features,
+    keep_geometries,
+    register_photos,
+)
 from nerfcli.poses.input.job import Job, Report, WorkMask, every_second, read_stage, stage_key, write_stage
 from nerfcli.poses.input.plan import limit_seconds, matching_seconds
 
@@ -146,12 +152,6 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
             left = len(pairs) - done()
             cut_short = f"matching: {left} of {len(pairs)} pairs are not matched after {duration(most)}"
     return cut_short
-
-
-def feature_counts(job: Job) -> list[int]:
-    """Return the number of features of each photo in the database."""
-    with pycolmap.Database.open(job.database) as database:
-        return [database.num_keypoints_for_image(image_id) for image_id in job.image_ids]
 
 
 def _extract(job: Job, numbers: Iterable[int], search: _Search, *, watched: Sequence[int], report: Report) -> None:

@@ -26,8 +26,8 @@ import pycolmap
 
 from nerfcli.child import take_stdout
 from nerfcli.poses.engine.attempts import map_with_fallbacks
-from nerfcli.poses.engine.database import discard_if_damaged, evidence, name_images, register_photos
-from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
+from nerfcli.poses.engine.database import discard_if_damaged, evidence, feature_counts, name_images, register_photos
+from nerfcli.poses.engine.features import extract, match, start_matching
 from nerfcli.poses.engine.mapping import MappedModels, file_keys, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.engine.remap import ChosenModel, choose_model
 from nerfcli.poses.engine.retrieval import select_pairs
