@@ -121,7 +121,7 @@ def test_a_way_to_map_that_was_ended_is_reported_and_a_check_once(job: Job, monk
     assert content["cut_short"] == ["global mapper: it took longer than 2 min"]
 
 
-def test_merging_ends_at_its_limit(job: Job, tmp_path: Path):
+def test_merging_ends_at_its_limit(job: Job):
     """Without time, two overlapping models stay two; with time, they become one."""
     whole = map_with_fallbacks(job, lambda *progress: None).models[0]
     first, second = pycolmap.Reconstruction(whole), pycolmap.Reconstruction(whole)
@@ -132,13 +132,7 @@ def test_merging_ends_at_its_limit(job: Job, tmp_path: Path):
             second.deregister_frame(second.image(photo).frame_id)
     sizes, said = {}, []
     for seconds in (-1.0, 1e9):
-        merged = merging.merge_models(
-            [first, second],
-            job,
-            output=tmp_path / "merged",
-            seconds=seconds,
-            tell=said.append,
-        )
+        merged = merging.merge_models([first, second], job, seconds=seconds, tell=said.append)
         sizes[seconds] = [model.num_reg_images() for model in merged]
     assert sizes == {-1.0: [5, 4], 1e9: [8]}
     assert said == ["merging: 1 of 2 sub-models are left after -1 s"]

@@ -16,7 +16,6 @@ from nerfcli.poses.engine import remap
 from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.mapping import MappedModels
 from nerfcli.poses.engine.remap import ChosenModel, choose_model
-from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.examine import examine
 
 FAR = (40.0, 0.0, 0.0)
@@ -54,7 +53,7 @@ def misled(apart: tuple[list[View], MappedModels], tmp_path: Path) -> MappedMode
 
 def choose(mapped: MappedModels) -> tuple[ChosenModel, list[str]]:
     notes: list[str] = []
-    return choose_model(mapped, lambda *progress: None, notes.append, checks=Checks), notes
+    return choose_model(mapped, lambda *progress: None, notes.append), notes
 
 
 def test_a_model_is_not_grown_over_photos_that_match_none_of_its_own(

@@ -31,7 +31,6 @@ from nerfcli.poses.engine.remap import ChosenModel, choose_model, extend_accepte
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.judge import acceptance
 from nerfcli.poses.judge.acceptance import Failure, Verdict, judge
-from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import leave_out_contradicting
 from nerfcli.poses.judge.examine import ExaminedModel, examine
 from nerfcli.poses.judge.parallax import best_rotation_fit
@@ -185,7 +184,7 @@ def test_a_contradicted_model_is_mapped_again_from_its_sound_part(
     wrong = wrongly_mapped(solved, tmp_path / "again")
     assert is_contradicted(refused.verdict)
     notes: list[str] = []
-    chosen = remap_refused(ChosenModel(wrong, refused), lambda *progress: None, notes.append, checks=Checks)
+    chosen = remap_refused(ChosenModel(wrong, refused), lambda *progress: None, notes.append)
     assert chosen.examined.verdict.accepted
     assert chosen.examined.model is not None
     assert [attempt["models"] for attempt in chosen.mapped.attempts] == [[10], [10]]
@@ -230,7 +229,7 @@ def test_an_accepted_model_takes_in_the_photos_of_a_smaller_one(
     monkeypatch.setattr(remap, "examine", noted)
     for _ in range(2):  # the second time, from what was kept
         notes: list[str] = []
-        found = choose_model(mapped, lambda *progress: None, notes.append, checks=Checks)
+        found = choose_model(mapped, lambda *progress: None, notes.append)
         assert found.examined.verdict.accepted
         assert [model.num_reg_images() for model in found.mapped.models] == [10]
         assert found.examined.model is not None
@@ -251,7 +250,7 @@ def test_an_accepted_model_grows_with_the_lens_that_was_chosen_for_it(solved: So
     richer = convert_camera(camera, "OPENCV")
     camera.model, camera.params = richer.model, richer.params.tolist()
     notes: list[str] = []
-    found = extend_accepted(ChosenModel(mapped, first), lambda *progress: None, notes.append, checks=Checks)
+    found = extend_accepted(ChosenModel(mapped, first), lambda *progress: None, notes.append)
     assert notes[-1] == "from the accepted model: 10 of 10 photos registered, accepted"
     assert found.mapped.models[0].num_reg_images() == 10
 
@@ -267,7 +266,7 @@ def test_a_model_that_grows_into_a_wrong_one_or_not_at_all_stays_as_it_was(
     examined = iter([examine] * (2 if grown == "wrong" else 1))
     monkeypatch.setattr(remap, "examine", lambda *arguments, **options: next(examined)(*arguments, **options))
     notes: list[str] = []
-    found = choose_model(mapped, lambda *progress: None, notes.append, checks=Checks)
+    found = choose_model(mapped, lambda *progress: None, notes.append)
     assert found.examined.verdict.accepted
     assert [model.num_reg_images() for model in found.mapped.models] == [7, 4]
     if grown == "wrong":
@@ -298,7 +297,7 @@ def test_each_way_stands_in_for_the_one_before(
     wrong = wrongly_mapped(solved, tmp_path / "again")
     for name in ("_extend_part", "_map_globally", "_map_from_scratch")[:failing]:
         monkeypatch.setattr(remap, name, lambda *arguments: [])
-    chosen = remap_refused(ChosenModel(wrong, refused), lambda *progress: None, lambda note: None, checks=Checks)
+    chosen = remap_refused(ChosenModel(wrong, refused), lambda *progress: None, lambda note: None)
     assert chosen.examined.verdict.accepted
     assert [attempt["models"] for attempt in chosen.mapped.attempts] == attempts
 
@@ -313,7 +312,7 @@ def test_mapping_again_is_bounded_in_time_and_says_what_contradicts_where_no_pai
     verdict = Verdict({"pairs": {"judged": 15, "contradicting": 0}}, (Failure("contradict", evidence, "more photos"),))
     first = replace(refused, verdict=verdict)
     notes: list[str] = []
-    chosen = remap_refused(ChosenModel(wrong, first), lambda *progress: None, notes.append, checks=Checks)
+    chosen = remap_refused(ChosenModel(wrong, first), lambda *progress: None, notes.append)
     assert notes[0] == f"{evidence}: mapping again, for at most 0 s"
     assert sum(note.endswith(": skipped, since no time is left") for note in notes) == 4
     assert "from scratch, with other initial pairs: skipped, since no time is left" in notes
@@ -336,7 +335,7 @@ def test_a_way_is_skipped_that_takes_longer_than_what_is_left(
     monkeypatch.setattr(remap, "_extend_part", late)
     monkeypatch.setattr(remap, "_map_globally", late)
     notes: list[str] = []
-    chosen = remap_refused(ChosenModel(wrong, refused), lambda *progress: None, notes.append, checks=Checks)
+    chosen = remap_refused(ChosenModel(wrong, refused), lambda *progress: None, notes.append)
     assert "next: from the largest consistent part (about 30 s)" in notes
     assert "from scratch, with other initial pairs: skipped, since it takes about 2 min, and 70 s are left" in notes
     assert chosen.mapped.attempts[-1]["what"] == "only the largest consistent part of the first model"
@@ -797,17 +796,14 @@ def test_pairs_of_perspective_photos_ask_for_no_fisheye(solved: Solved):
     assert detect_fisheyes(solved.job) is None
 
 
-def test_sub_models_are_merged_where_they_overlap(solved: Solved, tmp_path: Path):
+def test_sub_models_are_merged_where_they_overlap(solved: Solved):
     """Two models of photos 1...6 and 6...10, the second turned, moved and three times as large, become the whole."""
     first, second = (without(solved.model, left, tear_down=False) for left in (range(7, 11), range(1, 6)))
     turn = pycolmap.Rotation3d(np.array([0.3, -0.4, 1.2]))
     second.transform(pycolmap.Sim3d(3.0, turn, np.array([5.0, -2.0, 1.0])))
     reports: list[tuple[str, int, int]] = []
     merged = merging.merge_models(
-        [first, second],
-        solved.job,
-        output=tmp_path / "merged",
-        report=lambda stage, done, total: reports.append((stage, done, total)),
+        [first, second], solved.job, report=lambda stage, done, total: reports.append((stage, done, total))
     )
     assert reports == [("merge", 0, 2), ("merge", 1, 2), ("merge", 2, 2)]
     assert [model.num_reg_images() for model in merged] == [10]
@@ -830,11 +826,11 @@ def test_a_model_that_the_matches_contradict_is_left_out_when_several_are_joined
     assert sorted(joined.reg_image_ids()) == list(range(1, 9))
 
 
-def test_models_with_nothing_in_common_stay_apart(solved: Solved, tmp_path: Path):
+def test_models_with_nothing_in_common_stay_apart(solved: Solved):
     first, second = (without(solved.model, left, tear_down=False) for left in (range(4, 11), range(1, 4)))
     for point_id in sorted(second.point3D_ids()):
         second.delete_point3D(point_id)
-    merged = merging.merge_models([second, first], solved.job, output=tmp_path / "m")
+    merged = merging.merge_models([second, first], solved.job)
     assert sorted(model.num_reg_images() for model in merged) == [3, 7]
 
 

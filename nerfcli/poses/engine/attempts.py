@@ -9,7 +9,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 import pycolmap
@@ -159,18 +158,12 @@ class MappingAttempts:
             if not self.has_time():
                 return
             self.announce(what)
-        number, job = len(self.record), self.job
+        job = self.job
         models = self._run_mapper(what, job, start)
         self.take(what, models, job)
         if len(models) > 1:
-            merged = merge_models(
-                models,
-                job,
-                output=Path(job.folder) / f"merged_{number}",
-                seconds=mapper_limit_seconds(self.photos),
-                report=self.report,
-                tell=self._cut,
-            )
+            seconds = mapper_limit_seconds(self.photos)
+            merged = merge_models(models, job, seconds=seconds, report=self.report, tell=self._cut)
             if _placed(merged) > _placed(models):
                 self.take("sub-models merged", merged, job)
 

@@ -22,7 +22,7 @@ from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import FOLLOWERS, capture_order
 from nerfcli.poses.input.plan import LEAST_LIMIT_SECONDS, at_once_seconds, mapping_seconds
 from nerfcli.poses.judge.acceptance import Verdict
-from nerfcli.poses.judge.checks import Checks
+from nerfcli.poses.judge.checks import checks_of
 from nerfcli.poses.judge.contradictions import without_photos
 from nerfcli.poses.judge.examine import ExaminedModel, examine
 from nerfcli.poses.judge.parallax import NO_PARALLAX_PX
@@ -49,17 +49,16 @@ class ChosenModel:
     examined: ExaminedModel
 
 
-def choose_model(mapped: MappedModels, report: Report, tell: Tell, *, checks: Callable[[], Checks]) -> ChosenModel:
+def choose_model(mapped: MappedModels, report: Report, tell: Tell) -> ChosenModel:
     """Examine the largest model; map again if pairs of photos contradict it, or extend it if it is accepted.
 
-    `checks` makes a check runner for one model. Smaller models stay if they have most of their photos, and at least 3,
-    for themselves.
+    Smaller models stay if they have most of their photos, and at least 3, for themselves.
     """
-    examined = examine(mapped.models[:1], mapped.job, report, located=mapped.located, checks=checks())
+    examined = examine(mapped.models[:1], mapped.job, report, located=mapped.located, checks=checks_of(mapped.job))
     if not is_contradicted(examined.verdict) and not examined.verdict.accepted:
         return ChosenModel(mapped, examined)
     again = extend_accepted if examined.verdict.accepted else remap_refused
-    chosen = again(ChosenModel(mapped, examined), report, tell, checks=checks)
+    chosen = again(ChosenModel(mapped, examined), report, tell)
     if chosen.examined is examined or not chosen.examined.verdict.accepted:
         return chosen
     first, *found = chosen.mapped.models
@@ -80,11 +79,10 @@ def is_contradicted(verdict: Verdict) -> bool:
     return not only_turns and any("contradict" in kind or "look alike" in kind for kind in kinds)
 
 
-def remap_refused(given: ChosenModel, report: Report, tell: Tell, *, checks: Callable[[], Checks]) -> ChosenModel:
+def remap_refused(given: ChosenModel, report: Report, tell: Tell) -> ChosenModel:
     """Map again in one way after the other, for at most twice the time of the first mapping, or for a minute.
 
-    `checks` makes a check runner for one more model. Returns the first accepted model, which may be the largest
-    consistent part of the given one; else the given one.
+    Returns the first accepted model, which may be the largest consistent part of the given one; else the given one.
     """
     mapped, verdict, start = given.mapped, given.examined.verdict, time.perf_counter()
     job, scratch, pairs = mapped.job, mapped.seconds, verdict.measures["pairs"]
@@ -121,7 +119,7 @@ def remap_refused(given: ChosenModel, report: Report, tell: Tell, *, checks: Cal
             continue
         tell(f"next: {what}" + (f" (about {duration(takes)})" if takes else ""))
         seconds = max(left, LEAST_LIMIT_SECONDS) if what == _GLOBALLY else 2.0 * mapper_limit_seconds(len(job.files))
-        found = _attempt(what, make, given.mapped, report, tell, runner=checks(), seconds=seconds)
+        found = _attempt(what, make, given.mapped, report, tell, seconds=seconds)
         if found is None:
             continue
         if found.examined.verdict.accepted:
@@ -131,7 +129,7 @@ def remap_refused(given: ChosenModel, report: Report, tell: Tell, *, checks: Cal
     return given
 
 
-def extend_accepted(given: ChosenModel, report: Report, tell: Tell, *, checks: Callable[[], Checks]) -> ChosenModel:
+def extend_accepted(given: ChosenModel, report: Report, tell: Tell) -> ChosenModel:
     """Extend an accepted model to the photos of smaller models, if these are many and match its photos.
 
     Returns a larger accepted model, or the given one.
@@ -150,16 +148,12 @@ def extend_accepted(given: ChosenModel, report: Report, tell: Tell, *, checks: C
     what = "from the accepted model"
     takes = mapped.seconds * len(apart) / (len(placed) + len(apart))
     tell(f"{several(len(apart), 'photo')} in smaller models, next: {what} (about {duration(takes)})")
-    found = _attempt(
-        what,
-        lambda: _extend(pycolmap.Reconstruction(model), frozenset(), mapped.job, report),
-        mapped,
-        report,
-        tell,
-        runner=checks(),
-        seconds=2.0 * mapper_limit_seconds(len(mapped.job.files)),
-        beyond=len(placed),
-    )
+
+    def make() -> list[pycolmap.Reconstruction]:
+        return _extend(pycolmap.Reconstruction(model), frozenset(), mapped.job, report)
+
+    seconds = 2.0 * mapper_limit_seconds(len(mapped.job.files))
+    found = _attempt(what, make, mapped, report, tell, seconds=seconds, beyond=len(placed))
     if found is None:
         return given
     if found.examined.verdict.accepted and found.mapped.attempts[-1]["models"][0] > len(placed):
@@ -174,7 +168,6 @@ def _attempt(
     report: Report,
     tell: Tell,
     *,
-    runner: Checks,
     seconds: float,
     beyond: int = 0,
 ) -> ChosenModel | None:
@@ -182,6 +175,7 @@ def _attempt(
 
     It must have more photos than `beyond`.
     """
+    runner = checks_of(mapped.job)
     models = runner.run(what, make, otherwise=[], seconds=seconds)
     if not models or models[0].num_reg_images() <= beyond:
         nothing = runner.not_computed.get(what, "nothing to map")

@@ -34,8 +34,7 @@ from nerfcli.poses.engine.retrieval import select_pairs
 from nerfcli.poses.engine.strict import place_held_out, training_part
 from nerfcli.poses.engine.turntable import describe_motions, mask_turning_object, recall_masks
 from nerfcli.poses.input.job import Job, Report, Tell, read_job, read_stage, stage_key, write_stage
-from nerfcli.poses.input.plan import checking_seconds, limit_seconds
-from nerfcli.poses.judge.checks import Checks
+from nerfcli.poses.judge.checks import checks_of
 from nerfcli.poses.model.lens_evidence import lenses_of
 from nerfcli.poses.model.principal_points import StabilisedModel, camera_of_lens, choose_principal_points
 from nerfcli.poses.model.reasons import FEW_MATCHES
@@ -229,22 +228,17 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
     """Map the photos, refine and accept a model, write it, and return the data for the report and "job", as mapped."""
     seconds = {"extract": 0.0, "match": 0.0, "map": 0.0, "check": 0.0}
     mapped = _map(job, report, tell, seconds=seconds)
-    checks = partial(_checks, job)
     with _timed(seconds, "check"):
-        chosen = choose_model(mapped, report, tell, checks=checks)
+        chosen = choose_model(mapped, report, tell)
     result = describe_result(chosen, job) | {"seconds": seconds, "model_files": {}, "job": chosen.mapped.job}
     model, uncertainty = chosen.examined.model, chosen.examined.uncertainty
     if model is None:
         return result
-    lens_of, finishing = lenses_of(model), checks()
+    lens_of, finishing = lenses_of(model), checks_of(job)
     if chosen.examined.verdict.accepted:
-        choose = partial(choose_principal_points, solver=job.solver)
+        choose = partial(choose_principal_points, model, job.solver, report=report)
         with _timed(seconds, "stabilisation"):
-            found = finishing.run(
-                "principal points",
-                partial(choose, model, report=report),
-                otherwise=StabilisedModel(model, None, {}),
-            )
+            found = finishing.run("principal points", choose, otherwise=StabilisedModel(model, None, {}))
         model, result["principal_points"] = found.model, found.evidence and asdict(found.evidence)
         uncertainty = uncertainty | found.uncertainty
     model = finishing.run("colours of points", partial(colour_points, model, job), otherwise=model)
@@ -299,19 +293,13 @@ def _mask_object(
     """
     if any(group.is_panorama for group in job.groups):
         return job, None
-    checks, name = _checks(job), "moving foreground"
+    checks, name = checks_of(job), "moving foreground"
     with _timed(seconds, "motions"):
         found = checks.run(name, lambda: mask_turning_object(job, tell), otherwise=None)
     if found is None:
         tell(f"could not check for an object moving in front of a static background: {checks.not_computed[name]}")
         return job, None
     return found
-
-
-def _checks(job: Job) -> Checks:
-    """Make a check runner for one model."""
-    most = limit_seconds(checking_seconds(len(job.files)))
-    return Checks(Path(job.folder), skip=dict(job.skipped_checks), seconds=most)
 
 
 @contextmanager

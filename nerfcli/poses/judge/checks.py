@@ -11,6 +11,8 @@ from typing import TypeVar
 
 from nerfcli.atomic import write_json
 from nerfcli.errors import reason_of
+from nerfcli.poses.input.job import Job
+from nerfcli.poses.input.plan import checking_seconds, limit_seconds
 
 T = TypeVar("T")
 
@@ -55,3 +57,9 @@ class Checks:
         finally:
             if marker is not None:
                 marker.unlink(missing_ok=True)
+
+
+def checks_of(job: Job) -> Checks:
+    """Return a runner of the checks of one model of a job's photos, within a time limit."""
+    most = limit_seconds(checking_seconds(len(job.files)))
+    return Checks(Path(job.folder), skip=dict(job.skipped_checks), seconds=most)

@@ -7,10 +7,11 @@ aligns many of these pairs joins the models.
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pycolmap
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from nerfcli.cameras.alignment import align as similarity
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import duration
-from nerfcli.poses.input.job import Job
+from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.held_out import MAPPER
 from nerfcli.poses.model.intrinsics import refine_model
@@ -55,10 +56,9 @@ def merge_models(
     models: Sequence[pycolmap.Reconstruction],
     job: Job,
     *,
-    output: Path,
     seconds: float = math.inf,
-    report: Callable[[str, int, int], None] = lambda stage, done, total: None,
-    tell: Callable[[str], None] = lambda text: None,
+    report: Report = lambda stage, done, total: None,
+    tell: Tell = lambda text: None,
 ) -> list[pycolmap.Reconstruction]:
     """Return the models, largest first, each merged with those smaller ones that have enough in common with it.
 
@@ -66,7 +66,6 @@ def merge_models(
 
     Args:
         models: of the job's database, largest first; they are not changed.
-        output: a folder for temporary files of pycolmap.
         seconds: time after which the remaining models are not merged.
         report: called with ("merge", models done, models in all).
         tell: called with what was cut short, if anything was.
@@ -95,7 +94,7 @@ def merge_models(
             left = [model for model in left if not any(model is one.model for one in taken)]
             grows = bool(taken)
         if not any(base is model for model in models):
-            base = _triangulated_again(base, job, output=output)
+            base = _triangulated_again(base, job)
         merged.append(base)
     report("merge", len(models), len(models))
     return _largest_first(merged)
@@ -228,22 +227,17 @@ def _merge_tracks(model: pycolmap.Reconstruction, cache: pycolmap.DatabaseCache,
     mapper.end_reconstruction(discard=False)
 
 
-def _triangulated_again(model: pycolmap.Reconstruction, job: Job, *, output: Path) -> pycolmap.Reconstruction:
+def _triangulated_again(model: pycolmap.Reconstruction, job: Job) -> pycolmap.Reconstruction:
     """Return the model with points from all matches, adjusted until it converges."""
-    output.mkdir(parents=True, exist_ok=True)
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=job.threads, random_seed=job.seed, extract_colors=False, ba_global_max_refinements=_REFINEMENTS
     )
     options.mapper.random_seed = options.triangulation.random_seed = job.seed
-    model = pycolmap.triangulate_points(
-        model,
-        job.database,
-        output,
-        output,
-        clear_points=True,
-        options=options,
-        refine_intrinsics=not job.solver.fixed,
-    )
+    free = not job.solver.fixed
+    with TemporaryDirectory(dir=job.folder, prefix="merger-") as output:
+        model = pycolmap.triangulate_points(
+            model, job.database, output, output, clear_points=True, options=options, refine_intrinsics=free
+        )
     refine_model(model, job.solver)
     return model
 
