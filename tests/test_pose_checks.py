@@ -81,7 +81,7 @@ def mapped_model(job: Job) -> pycolmap.Reconstruction:
 
 def examined(model: pycolmap.Reconstruction, job: Job, checks: Checks | None = None) -> dict[str, Any]:
     """Return what the report says about a model, after a round trip through JSON."""
-    found = examine.examine([model], job, lambda *progress: None, checks=checks)
+    found = examine.examine([model], job, checks=checks)
     content = {"verdict": found.verdict.to_json(), "blur": found.blur_px, "left_out": found.left_out, **found.details}
     return json.loads(json.dumps(replace_non_finite(content), allow_nan=False))
 
@@ -368,7 +368,7 @@ def test_reasons_name_the_users_photos(job: Job, monkeypatch: pytest.MonkeyPatch
     named = replace(job, names=tuple(f"frame_{number + 1:05d}.jpg" for number in range(8)))
     reason = "contradicts the rest: its 28.5 matches with 00001.jpg cannot be"
     monkeypatch.setattr(examine, "leave_out_contradicting", lambda model, pairs: (model, {3: reason}))
-    found = examine.examine([mapped_model(job)], named, lambda *progress: None)
+    found = examine.examine([mapped_model(job)], named)
     assert found.left_out == {2: "contradicts the rest: its 28.5 matches with frame_00002.jpg cannot be"}
 
 

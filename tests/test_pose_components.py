@@ -77,7 +77,7 @@ def test_a_component_has_most_of_its_photos_for_itself(
     grown = synthetic.true_model(views)
     for image_id in range(taken + 1, 20):
         grown.deregister_frame(grown.image(image_id).frame_id)
-    accepted = examine(right.models[:1], right.job, lambda *progress: None)
+    accepted = examine(right.models[:1], right.job)
 
     def remapped(given: ChosenModel, *arguments: object, **options: object) -> ChosenModel:
         return ChosenModel(replace(given.mapped, models=[grown]), accepted)

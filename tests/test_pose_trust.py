@@ -74,7 +74,7 @@ def solve(folder: Path, views: Sequence[View], scene: Scene, noise: Noise = Nois
     synthetic.write_database(folder / "database.db", views, scene, noise=noise, seed=0, **options)
     job = synthetic.synthetic_job(folder, views, seed=0)
     mapped = map_with_fallbacks(job, lambda *progress: None)
-    examined = examine(mapped.models, mapped.job, lambda *progress: None, located=mapped.located)
+    examined = examine(mapped.models, mapped.job, located=mapped.located)
     return Solved(views, job, mapped, examined)
 
 
@@ -150,7 +150,7 @@ def test_a_wrong_result_with_low_residuals_is_refused(solved: Solved):
     same, left_out = leave_out_contradicting(wrong, pairs)
     assert same is wrong
     assert left_out == {}
-    verdict = judge(wrong, pairs, turn=None, names={"00005.jpg": "kitchen 5.jpg"})
+    verdict = judge(wrong, pairs, solved.job)
     assert verdict.failures[0].kind == "the poses contradict the strongest matches"
     assert "verified matches between" in verdict.failures[0].evidence
 
@@ -174,7 +174,7 @@ def wrongly_mapped(solved: Solved, folder: Path) -> MappedModels:
 def refused(solved: Solved, tmp_path_factory: pytest.TempPathFactory) -> ExaminedModel:
     """What the checks say of `wrongly_mapped`."""
     wrong = wrongly_mapped(solved, tmp_path_factory.mktemp("wrong") / "again")
-    return examine(wrong.models, wrong.job, lambda *progress: None)
+    return examine(wrong.models, wrong.job)
 
 
 def test_a_contradicted_model_is_mapped_again_from_its_sound_part(
@@ -244,7 +244,7 @@ def test_an_accepted_model_takes_in_the_photos_of_a_smaller_one(
 def test_an_accepted_model_grows_with_the_lens_that_was_chosen_for_it(solved: Solved, tmp_path: Path):
     """The mapper began with SIMPLE_RADIAL; the checks chose OPENCV."""
     mapped = in_two_parts(solved, tmp_path)
-    first = examine(mapped.models[:1], mapped.job, lambda *progress: None)
+    first = examine(mapped.models[:1], mapped.job)
     assert first.model is not None
     camera = first.model.cameras[1]
     richer = convert_camera(camera, "OPENCV")
@@ -452,7 +452,7 @@ def test_one_photo_that_contradicts_is_left_out(solved: Solved):
     assert set(left_out) == {10}
     assert left_out[10].startswith("contradicts the rest: its ")
     assert rest.num_reg_images() == 9
-    assert judge(rest, pairs, turn=None, names={}).accepted
+    assert judge(rest, pairs, solved.job).accepted
 
 
 def test_a_photo_far_from_all_others_is_left_out(solved: Solved):
@@ -536,7 +536,7 @@ def test_a_photo_placed_by_points_is_judged_with_what_holds_it(solved: Solved):
 
     def accepted(held: Sequence[VerifiedPair]) -> bool:
         evidence = [*rest, mistaken]
-        return judge(solved.model, evidence, turn=None, names={}, held=held).accepted
+        return judge(solved.model, evidence, solved.job, held=held).accepted
 
     assert not accepted([])
     assert accepted(held)
@@ -775,7 +775,7 @@ def test_a_model_that_grows_knows_the_photos_that_its_points_placed(solved: Solv
     monkeypatch.setattr(attempts, "map_photos", lambda *arguments, **options: [solved.model])
     tried.extend("lower angles", attempts.LOW_ANGLES)
     assert (tried.best.models, tried.best.located) == ([solved.model], (8, 9))
-    left = examine([without(solved.model, (8,))], solved.job, lambda *progress: None, located=tried.best.located)
+    left = examine([without(solved.model, (8,))], solved.job, located=tried.best.located)
     assert left.details["not_computed"] == {}
 
 

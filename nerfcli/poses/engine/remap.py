@@ -54,7 +54,7 @@ def choose_model(mapped: MappedModels, report: Report, tell: Tell) -> ChosenMode
 
     Smaller models stay if they have most of their photos, and at least 3, for themselves.
     """
-    examined = examine(mapped.models[:1], mapped.job, report, located=mapped.located, checks=checks_of(mapped.job))
+    examined = examine(mapped.models[:1], mapped.job, report, located=mapped.located)
     if not is_contradicted(examined.verdict) and not examined.verdict.accepted:
         return ChosenModel(mapped, examined)
     again = extend_accepted if examined.verdict.accepted else remap_refused

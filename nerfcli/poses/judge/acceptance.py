@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from nerfcli.poses.input.job import Solver
-from nerfcli.poses.judge.checks import Checks
+from nerfcli.poses.input.job import Job, Solver
+from nerfcli.poses.judge.checks import Checks, checks_of
 from nerfcli.poses.judge.contradictions import Contradiction, strong_contradictions
 from nerfcli.poses.judge.parallax import RotationFit
 from nerfcli.poses.model import held_out
@@ -73,31 +73,27 @@ class Verdict:
 def judge(
     model: pycolmap.Reconstruction,
     pairs: Sequence[VerifiedPair],
-    solver: Solver = Solver(),
+    job: Job,
     *,
-    turn: RotationFit | None,
-    names: Mapping[str, str],
+    turn: RotationFit | None = None,
     held: Sequence[VerifiedPair] = (),
-    given: Collection[int] = (),
     determined: Collection[int] = (),
     checks: Checks | None = None,
 ) -> Verdict:
-    """Measure a model against the evidence and decide whether to accept it.
+    """Measure a model of a job's photos against the evidence and decide whether to accept it.
 
     A value that cannot be measured is None, and counts neither for nor against the model.
 
     Args:
         model: a converged model.
         turn: how well rotations of the camera alone explain the matches.
-        names: the user's name for each photo of the model.
         held: pairs that support photos located from points of the model, see `locate.shared_pairs`.
-        given: ids of cameras with given intrinsics, whose focal lengths are not checked.
         determined: ids of cameras whose focal lengths are known to 1 %, see `lens_observability.focal_is_determined`.
     """
-    run = (Checks() if checks is None else checks).run
+    run = (checks or checks_of(job)).run
     found: list[PairAgreement] = run("agreement of pairs", lambda: agreements(model, pairs), otherwise=[])
     rotations: list[RotationError] = run(
-        "rotations of pairs", lambda: rotation_errors(model, pairs, solver), otherwise=[]
+        "rotations of pairs", lambda: rotation_errors(model, pairs, job.solver), otherwise=[]
     )
     contradictions: list[Contradiction] = run(
         "contradictions", lambda: strong_contradictions(model, [*found, *agreements(model, held)]), otherwise=[]
@@ -106,11 +102,7 @@ def judge(
     fraction = sum(c.matches for c in contradictions) / total if total else 0.0
     geometry = run("geometry of points and cameras", lambda: _geometry(model), otherwise=_UNKNOWN_GEOMETRY)
     focal = [_focal_measure(camera) for camera in _cameras_in_use(model) if not camera.is_spherical()]
-    unused = run(
-        "unused observations",
-        lambda: _held_out_measure(model, solver),
-        otherwise=_UNKNOWN_HELD_OUT,
-    )
+    unused = run("unused observations", lambda: _held_out_measure(model, job.solver), otherwise=_UNKNOWN_HELD_OUT)
     counts = [model.image(photo).num_points3D for photo in model.reg_image_ids()] or [0]
     measures: dict[str, Any] = {
         "pairs": {
@@ -129,9 +121,9 @@ def judge(
     }
     failures = [
         *_no_baseline(turn, geometry, unused["median_px"]),
-        *_contradicted(contradictions, fraction, found, names=names),
+        *_contradicted(contradictions, fraction, found, names=dict(zip(job.files, job.names, strict=True))),
         *_turned(measures["rotations"]),
-        *_implausible(model, measures, given=given, determined=determined),
+        *_implausible(model, measures, given=job.given_cameras, determined=determined),
     ]
     return Verdict(measures, tuple(failures))
 
@@ -280,22 +272,18 @@ def _implausible(
     determined: Collection[int] = (),
 ) -> list[Failure]:
     """Return a failure for each value that no real capture has."""
-    checks = [
-        (
-            measures["triangulation_angle_deg"],
-            held_out.LEAST_ANGLE_DEG,
-            False,
-            "points are seen at {:.2f} degrees in the median",
-        ),
-        (measures["share_in_front"], 0.95, False, "only {:.0%} of the observations lie before their camera"),
-        (measures["held_out"]["median_px"], held_out.MOST_ERROR_PX, True, "unused observations are {:.1f} px off"),
-        (measures["observations_per_photo"]["median"], MIN_MATCHES, False, "photos see {:.0f} points each"),
+    angle_deg = measures["triangulation_angle_deg"]
+    limits = [
+        (angle_deg, held_out.LEAST_ANGLE_DEG, np.inf, "points are seen at {:.2f} degrees in the median"),
+        (measures["share_in_front"], 0.95, np.inf, "only {:.0%} of the observations lie before their camera"),
+        (measures["held_out"]["median_px"], 0.0, held_out.MOST_ERROR_PX, "unused observations are {:.1f} px off"),
+        (measures["observations_per_photo"]["median"], MIN_MATCHES, np.inf, "photos see {:.0f} points each"),
     ]
     advice = "take photos with more overlap while moving sideways"
     failures = [
         Failure("the photos do not constrain the poses", text.format(value), advice)
-        for value, limit, above, text in checks
-        if value is not None and (value > limit if above else value < limit)
+        for value, least, most, text in limits
+        if value is not None and (value < least or value > most)
     ]
     focals = {
         camera.camera_id: _focal_measure(camera)
@@ -307,12 +295,9 @@ def _implausible(
     if sum(photos[camera_id] for camera_id in unusual) < _FEW * photos.total():
         determined = unusual
     advice = "give the intrinsics with --intrinsics, or use photos with EXIF data"
+    text = "the estimated focal length is {:.2f} times the longer side"
     return failures + [
-        Failure(
-            "the intrinsics are implausible",
-            f"the estimated focal length is {focals[camera_id]:.2f} times the longer side",
-            advice,
-        )
+        Failure("the intrinsics are implausible", text.format(focals[camera_id]), advice)
         for camera_id in unusual
         if camera_id not in determined or not _within(_WIDER_FOCAL_RANGE, focals[camera_id])
     ]

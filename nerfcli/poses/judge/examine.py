@@ -10,7 +10,7 @@ camera's axes, and the change of t; J maps them to pixels; a similarity has thet
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,9 +18,9 @@ import numpy as np
 import pycolmap
 
 from nerfcli.matching.graph import connected_groups
-from nerfcli.poses.input.job import Job, Solver
+from nerfcli.poses.input.job import Job, Report, Solver
 from nerfcli.poses.judge.acceptance import Verdict, judge, nothing_placed
-from nerfcli.poses.judge.checks import Checks
+from nerfcli.poses.judge.checks import Checks, checks_of
 from nerfcli.poses.judge.contradictions import leave_out_contradicting, without_photos
 from nerfcli.poses.judge.parallax import RotationFit, best_rotation_fit, panorama_rotation_fit
 from nerfcli.poses.model import held_out
@@ -55,7 +55,7 @@ class ExaminedModel:
 def examine(
     models: list[pycolmap.Reconstruction],
     job: Job,
-    report: Callable[[str, int, int], None],
+    report: Report = lambda stage, done, total: None,
     *,
     located: Sequence[int] = (),
     checks: Checks | None = None,
@@ -67,7 +67,7 @@ def examine(
     `report` is called with ("check", done, total); `located` are ids of images that, where the model places them, are
     supported by its points instead of a pair.
     """
-    checks = Checks() if checks is None else checks
+    checks = checks or checks_of(job)
     pairs = read_verified_pairs(job.database, min_matches=MIN_MATCHES)
     strong = [pair for pair in pairs if pair.matches >= FEW_MATCHES]
     turn = checks.run("parallax", lambda: _rotation_fit(strong, job), otherwise=None)
@@ -75,7 +75,6 @@ def examine(
     details: dict[str, Any] = {"parts": [len(part) for part in joined if len(part) > 1]}
     if not models:
         return ExaminedModel(None, nothing_placed(turn), {}, {}, details | {"not_computed": checks.not_computed})
-    names = dict(zip(job.files, job.names, strict=True))
     report("check", 0, 4)
     mapped = without_photos(models[0])
     single = [photo for photo in located if mapped.exists_image(photo)]
@@ -89,36 +88,22 @@ def examine(
     lenses = checks.run("lens models", lambda: _with_lenses(model, job), otherwise=ModelLenses(model, {}))
     model = lenses.model
     report("check", 2, 4)
-    verdict = judge(
-        model,
-        pairs,
-        job.solver,
-        held=held,
-        turn=turn,
-        names=names,
-        given=job.given_cameras,
-        determined=[camera for camera, found in lenses.uncertainty.items() if focal_is_determined(found)],
-        checks=checks,
-    )
+    determined = [camera for camera, found in lenses.uncertainty.items() if focal_is_determined(found)]
+    verdict = judge(model, pairs, job, turn=turn, held=held, determined=determined, checks=checks)
     report("check", 3, 4)
     blur: dict[int, float] = {}
     if verdict.accepted and model.num_reg_images() <= 500:  # with more photos, the joint covariance takes minutes
         blur = checks.run("pose uncertainty", lambda: pose_blur_px(model, job.solver), otherwise=blur)
     report("check", 4, 4)
+    names = dict(zip(job.files, job.names, strict=True))
     # In one pass, since a photo's own name may contain the numbered name of another one.
     reasons = {
         job.numbers[image_id]: re.sub(r"\d+\.\w+", lambda file: names.get(file[0], file[0]), reason)
         for image_id, reason in left_out.items()
     }
     details["not_computed"] = checks.not_computed
-    return ExaminedModel(
-        model,
-        verdict,
-        reasons,
-        {job.numbers[image_id]: px for image_id, px in blur.items()},
-        details,
-        lenses.uncertainty,
-    )
+    by_number = {job.numbers[image_id]: px for image_id, px in blur.items()}
+    return ExaminedModel(model, verdict, reasons, by_number, details, lenses.uncertainty)
 
 
 def _rotation_fit(pairs: Sequence[VerifiedPair], job: Job) -> RotationFit | None:
