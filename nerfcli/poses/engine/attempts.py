@@ -346,7 +346,8 @@ def locate_single_photos(attempts: MappingAttempts) -> None:
 
 
 def _without_exif(job: Job) -> Job:
-    return replace(job, groups=tuple(group.without_exif() for group in job.groups))
+    groups = (replace(group, focal_px=None, focal_is_prior=False) for group in job.groups)
+    return replace(job, groups=tuple(groups))
 
 
 def _tell_of_exif(given: Job, best: MappedModels, tell: Tell) -> None:
@@ -354,12 +355,11 @@ def _tell_of_exif(given: Job, best: MappedModels, tell: Tell) -> None:
 
     Photos of a camera that moves straight ahead determine the focal length poorly.
     """
+    cameras = best.models[0].cameras if best.models else {}  # of registered photos
     for number, (group, used) in enumerate(zip(given.groups, best.job.groups, strict=True), start=1):
-        if group.focal_px is None or used.focal_px is not None or not best.models:
+        if group.focal_px is None or used.focal_px is not None or number not in cameras:
             continue
-        if number not in best.models[0].cameras:  # none of its photos are registered
-            continue
-        found_px = best.models[0].camera(number).mean_focal_length()
+        found_px = cameras[number].mean_focal_length()
         if abs(math.log(found_px / group.focal_px)) > _FAR_FROM_EXIF:
             tell(
                 f"EXIF's focal length ({group.focal_px:.0f} px) was not used, since few photos registered with it; the "

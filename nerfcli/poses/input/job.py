@@ -10,7 +10,7 @@ import json
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -49,10 +49,6 @@ class CameraGroup:
     def is_panorama(self) -> bool:
         """Whether the photos show the whole sphere; their size then determines the camera."""
         return self.model == PANORAMA
-
-    def without_exif(self) -> "CameraGroup":
-        """Return the same group without EXIF's focal length."""
-        return replace(self, focal_px=None, focal_is_prior=False)
 
 
 @dataclass(frozen=True)

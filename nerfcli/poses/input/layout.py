@@ -41,13 +41,9 @@ def lay_out_photos(photos: Photos, work: Path) -> tuple[WorkPhoto, ...]:
     folder.mkdir(parents=True, exist_ok=True)
     content = read_stage(stage, _VERSION) or {"next": 0, "photos": {}}
     earlier = {name: WorkPhoto(**laid_out) for name, laid_out in content["photos"].items()}
-    following = content["next"]
-    numbers: dict[str, int] = {}
-    for photo in photos.photos:
-        if photo.name in earlier:
-            numbers[photo.name] = int(Path(earlier[photo.name].file).stem)
-        else:
-            numbers[photo.name], following = following, following + 1
+    new = [name for name in photos.names if name not in earlier]
+    numbers = {name: int(Path(found.file).stem) for name, found in earlier.items()}
+    numbers |= {name: number for number, name in enumerate(new, start=content["next"])}
 
     def lay_out_one(photo: Photo) -> WorkPhoto:
         return _laid_out(photos.folder, photo, folder, number=numbers[photo.name], earlier=earlier.get(photo.name))
@@ -55,7 +51,7 @@ def lay_out_photos(photos: Photos, work: Path) -> tuple[WorkPhoto, ...]:
     with ThreadPoolExecutor(_THREADS) as copiers:
         laid_out = tuple(copiers.map(lay_out_one, photos.photos))
     listed = {photo.name: asdict(found) for photo, found in zip(photos.photos, laid_out, strict=True)}
-    write_stage(stage, _VERSION, {"next": following, "photos": listed})
+    write_stage(stage, _VERSION, {"next": content["next"] + len(new), "photos": listed})
     return laid_out
 
 
