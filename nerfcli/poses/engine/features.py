@@ -18,7 +18,7 @@ from nerfcli.poses.engine.database import (
     keep_geometries,
     register_photos,
 )
-from nerfcli.poses.input.job import Job, Report, WorkMask, every_second, read_stage, stage_key, write_stage
+from nerfcli.poses.input.job import Job, Report, WorkMask, read_stage, repeatedly, stage_key, write_stage
 from nerfcli.poses.input.plan import limit_seconds, matching_seconds
 
 # Most RANSAC trials to verify a pair; pycolmap's 10,000 take twice as long and verify no further pair of 30 matches.
@@ -204,6 +204,6 @@ def _watched(stage: str, done: Callable[[], int], total: int, report: Report) ->
     pycolmap has no callbacks for these stages, so the database is polled, through pycolmap: see `database`.
     """
     report(stage, done(), total)
-    with every_second(lambda: report(stage, done(), total)):
+    with repeatedly(lambda: report(stage, done(), total)):
         yield
     report(stage, total, total)

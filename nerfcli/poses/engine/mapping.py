@@ -21,10 +21,10 @@ import nerfcli
 from nerfcli.poses.input.job import (
     Job,
     Report,
-    every_second,
     file_key,
     job_from_json,
     read_stage,
+    repeatedly,
     stage_key,
     write_stage,
 )
@@ -188,7 +188,7 @@ def _run_mapper(
 
     with (
         TemporaryDirectory(dir=job.folder, prefix="mapper-") as output,
-        every_second(lambda: token.cancel() if time.monotonic() - latest > longest else None),
+        repeatedly(lambda: token.cancel() if time.monotonic() - latest > longest else None),
     ):
         try:
             models = pycolmap.incremental_mapping(

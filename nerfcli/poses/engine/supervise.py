@@ -5,9 +5,8 @@ import os
 import shutil
 import signal
 import subprocess
-import threading
 import time
-from collections.abc import Callable
+from contextlib import closing
 from errno import ENOSPC
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 from nerfcli import child
 from nerfcli.errors import OUT_OF_MEMORY, UserError, duration
 from nerfcli.machine import resident_bytes
+from nerfcli.poses.input.job import Report, Tell, repeatedly
 from nerfcli.poses.input.plan import STAGES
 from nerfcli.poses.judge.checks import UNDERWAY
 
@@ -35,10 +35,10 @@ def run_worker(
     job_path: Path,
     *,
     threads: int,
-    progress: Callable[[str, int, int], None],
+    progress: Report,
     memory_bytes: int | None = None,
     lock: int | None = None,
-    notify: Callable[[str], None] = lambda note: None,
+    notify: Tell = lambda note: None,
 ) -> None:
     """Run `nerfcli.poses.engine.worker` on a job until it is done; it has ended when this returns or raises.
 
@@ -56,26 +56,18 @@ def run_worker(
     log = job_path.with_name("worker.log")
     stage = "starting"
     with log.open("wb") as stderr:
-        worker = child.spawn(
-            "nerfcli.poses.engine.worker",
-            job_path,
-            log=stderr,
-            threads=threads,
-            descriptors=() if lock is None else (lock,),
-        )
+        module, descriptors = "nerfcli.poses.engine.worker", () if lock is None else (lock,)
+        worker = child.spawn(module, job_path, log=stderr, threads=threads, descriptors=descriptors)
         underway = job_path.with_name(UNDERWAY)
-        guard = _Guard(worker, memory_bytes, underway=underway)
-        messages = child.messages(worker)
-        try:
+        guard = _Guard(worker, memory_bytes, underway)
+        # Memory can double in a second or two, when a photo is decoded or a bundle adjustment begins.
+        with repeatedly(guard.look, seconds=0.1), closing(child.messages(worker)) as messages:
             for message in messages:
                 if "note" in message:
                     notify(message["note"])
                     continue
                 stage = f"{STAGES[message['stage']].doing} ({message['done']} of {message['total']} done)"
                 progress(message["stage"], message["done"], message["total"])
-        finally:
-            messages.close()
-            guard.stop()
     if worker.returncode == 0:
         return
     if guard.reached == "check":
@@ -121,37 +113,27 @@ def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> Use
 
 
 class _Guard:
-    """Watches a worker from a thread, and kills it when it exceeds a limit; `reached` is then the name of the limit.
+    """Kills a worker when it exceeds a limit; `reached` is then the name of the limit.
 
     check: the content of `UNDERWAY` when it was last read.
     """
 
-    def __init__(self, worker: subprocess.Popen[bytes], most_bytes: int | None, *, underway: Path):
+    def __init__(self, worker: subprocess.Popen[bytes], most_bytes: int | None, underway: Path):
+        self._worker, self._most_bytes, self._underway = worker, most_bytes, underway
         self.reached: str | None = None
         self.check: dict[str, Any] = {}
-        self._underway = underway
         self._check_written, self._check_seen = 0, 0.0
-        self._worker = worker
-        self._most_bytes = most_bytes
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True)
-        self._thread.start()
 
-    def stop(self) -> None:
-        """Stop watching. The worker has ended by now."""
-        self._stopped.set()
-        self._thread.join()
-
-    def _watch(self) -> None:
-        # Memory can double in a second or two, when a photo is decoded or a bundle adjustment begins.
-        while not self._stopped.wait(0.1):
-            if self._most_bytes is not None and resident_bytes(self._worker.pid) > self._most_bytes:
-                self.reached = "memory"
-            elif self._is_overdue():
-                self.reached = "check"
-            if self.reached is not None:
-                self._worker.kill()
-                return
+    def look(self) -> None:
+        """Look at the worker's memory and at the time of its current check."""
+        if self.reached is not None:
+            return
+        if self._most_bytes is not None and resident_bytes(self._worker.pid) > self._most_bytes:
+            self.reached = "memory"
+        elif self._is_overdue():
+            self.reached = "check"
+        if self.reached is not None:
+            self._worker.kill()
 
     def _is_overdue(self) -> bool:
         """Return whether the current check has exceeded its time limit."""

@@ -209,12 +209,12 @@ def _seal(content: Any) -> str:
 
 
 @contextmanager
-def every_second(look: Callable[[], object]) -> Iterator[None]:
-    """Call `look` once a second from a thread of its own, until the block ends."""
+def repeatedly(look: Callable[[], object], *, seconds: float = 1.0) -> Iterator[None]:
+    """Call `look` each time so many seconds have passed, from a thread of its own, until the block ends."""
     finished = threading.Event()
 
     def watch() -> None:
-        while not finished.wait(1.0):
+        while not finished.wait(seconds):
             look()
 
     watcher = threading.Thread(target=watch)

@@ -6,7 +6,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from nerfcli.poses.model.projection import Array
+
 Indices = NDArray[np.int64]
 
 # Largest distance of a point from its predicted position, as a fraction of the longer side, and at least in pixels.
