@@ -49,11 +49,6 @@ def workspace(scene_dir: Path) -> Iterator[int]:
         yield lock
 
 
-def is_under_construction(scene_dir: Path) -> bool:
-    """Return whether an earlier call worked on a scene here, complete or not."""
-    return (scene_dir / "work" / _LOCK).is_file()
-
-
 def publish(scene_dir: Path, describe: Callable[[], None]) -> None:
     """Copy the worker's model into the scene; then `describe` writes the report and, last, scene.json.
 
@@ -100,7 +95,7 @@ def check_destination(scene_dir: Path, photos_dir: Path, *, subfolders: bool) ->
         )
     if scene_dir.exists() and not scene_dir.is_dir():
         raise UserError(f"cannot write the scene {scene_dir}: a file with this name exists", hint)
-    ours = (scene_dir / SCENE_FILE).is_file() or is_under_construction(scene_dir)
+    ours = (scene_dir / SCENE_FILE).is_file() or (scene_dir / "work" / _LOCK).is_file()
     if scene_dir.is_dir() and any(scene_dir.iterdir()) and not ours:
         raise UserError(f"cannot write the scene {scene_dir}: the folder contains other files", hint)
     refuse_read_only(scene_dir / "work")

@@ -83,14 +83,15 @@ class Plan:
 def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings) -> Plan:
     """Return the plan for these photos."""
     count, threads = len(photos.photos), settings.cores
-    all_pairs = count * (count - 1) // 2
+    all_pairs = math.comb(count, 2)
     pairs = min(len(pairing.pairs) + pairing.neighbours * count, all_pairs)
     sizes = [(photo.width, photo.height) for photo in photos.photos]
     searched = _searched_pixels(sizes, max_image_size=settings.max_image_size)
     features = min(settings.max_features, round(0.015 * sum(searched) / max(count, 1)))
+    look_alikes = all_pairs * 0.0003 * (retrieval_feature_count(count) / 256) ** 2
     seconds = {
         "extract": extraction_seconds(sizes, max_image_size=settings.max_image_size) / threads,
-        "pair": retrieval_seconds(count) / threads if pairing.neighbours else 0.0,
+        "pair": look_alikes / threads if pairing.neighbours else 0.0,
         "match": matching_seconds(pairs, max_features=features) / threads,
         "map": mapping_seconds(count),
         "check": checking_seconds(count),
@@ -117,11 +118,6 @@ def extraction_seconds(sizes: Iterable[tuple[int, int]], *, max_image_size: int)
 
 def _searched_pixels(sizes: Iterable[tuple[int, int]], *, max_image_size: int) -> list[float]:
     return [width * height * min(1.0, max_image_size / max(width, height)) ** 2 for width, height in sizes]
-
-
-def retrieval_seconds(photos: int) -> float:
-    """Estimate the CPU seconds to find look-alikes among this many photos."""
-    return math.comb(photos, 2) * 0.0003 * (retrieval_feature_count(photos) / 256) ** 2
 
 
 def matching_seconds(pairs: int, *, max_features: int) -> float:

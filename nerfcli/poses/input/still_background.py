@@ -122,7 +122,9 @@ def background(pictures: Sequence[np.ndarray], placed: Sequence[np.ndarray], pla
 
 def differs(picture: np.ndarray, behind: Background) -> np.ndarray:
     """Return where a picture (h, w, 3) differs from the background, (h, w) bool: the object, slightly dilated."""
-    raw = ((cv2.medianBlur(_distances(picture, behind), 5) > 1) | behind.covered).astype(np.uint8)
+    levels = picture.astype(np.float32)
+    tolerances = np.abs(levels * _gain(levels, behind) - behind.colours).max(axis=2) / behind.tolerance
+    raw = ((cv2.medianBlur(tolerances, 5) > 1) | behind.covered).astype(np.uint8)
     raw = cv2.morphologyEx(raw, cv2.MORPH_OPEN, _disc(1))
     closed = cv2.morphologyEx(np.pad(raw, _CLOSED_PX), cv2.MORPH_CLOSE, _disc(_CLOSED_PX))
     closed = closed[_CLOSED_PX:-_CLOSED_PX, _CLOSED_PX:-_CLOSED_PX]
@@ -149,12 +151,6 @@ def _warped(values: np.ndarray, similarity: np.ndarray, size: tuple[int, int], *
     """Return values (h, w) or (h, w, 3) in another frame of (width, height); a similarity (2, 3) leads from there."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(values, similarity, size, flags=flags, borderValue=(outside,) * 3)
-
-
-def _distances(picture: np.ndarray, behind: Background) -> np.ndarray:
-    """Return how far each pixel is from the background's colour, in tolerances, float32 (h, w)."""
-    levels = picture.astype(np.float32)
-    return np.abs(levels * _gain(levels, behind) - behind.colours).max(axis=2) / behind.tolerance
 
 
 def _gain(picture: np.ndarray, behind: Background) -> np.ndarray:

@@ -41,7 +41,8 @@ def group_photos(photos: Photos, *, model: str) -> PhotoGroups:
     for numbers in camera_groups(photos.photos):
         members = [photos.photos[number] for number in numbers]
         first = members[0]
-        if model == PANORAMA or (model == "auto" and _are_panoramas(members)):
+        look_like_it = sum(photo.is_panorama for photo in members) > MOST_OF_A_CAMERA * len(members)
+        if model == PANORAMA or (model == "auto" and look_like_it):
             groups.append(_panoramas(numbers, first))
             continue
         evidence = focal_evidence(first.exif)
@@ -63,11 +64,6 @@ def group_photos(photos: Photos, *, model: str) -> PhotoGroups:
         return PhotoGroups(tuple(groups), notes)
     by = "folder, EXIF and size" if any("/" in name for name in photos.names) else "EXIF and size"
     return PhotoGroups(tuple(groups), (f"{len(groups)} cameras, by {by}: {_summary(groups)}", *notes))
-
-
-def _are_panoramas(photos: Sequence[Photo]) -> bool:
-    """Return whether photos of one camera are panoramas: most of them have to look like one."""
-    return sum(photo.is_panorama for photo in photos) > MOST_OF_A_CAMERA * len(photos)
 
 
 def _panoramas(photos: tuple[int, ...], first: Photo) -> CameraGroup:

@@ -239,12 +239,9 @@ def _border_px(evidence: LensEvidence, found: Estimate, name: str) -> float:
     return found.deviation(name) * float(evidence.border_px[NAMES.index(name)])
 
 
-def _model_name(free: Sequence[str]) -> str:
-    return _MODELS[frozenset(free) - {"f", *_PRINCIPAL_POINT}]
-
-
 def _camera(camera: pycolmap.Camera, found: Estimate, *, named: bool) -> pycolmap.Camera:
     """Return a camera with the estimated parameters; those that were not free keep their values, or are absent."""
     values = lens_values(camera)
     values[[NAMES.index(name) for name in found.names]] = found.values
-    return camera_with(camera, camera.model.name if named else _model_name(found.names), values)
+    name = camera.model.name if named else _MODELS[frozenset(found.names) - {"f", *_PRINCIPAL_POINT}]
+    return camera_with(camera, name, values)
