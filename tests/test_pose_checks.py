@@ -138,7 +138,7 @@ def test_photos_without_a_pose_do_not_end_the_covariance(job: Job):
     content = examined(model, job)
     assert content["not_computed"] == {}
     assert content["verdict"]["accepted"]
-    assert sorted(content["blur"]) == ["0", "1", "3", "4", "5", "6", "7"]
+    assert sorted(content["blur"]) == [name for name in job.names if name != job.name_of[3]]
 
 
 def test_a_check_that_raises_is_listed_and_the_others_go_on(job: Job, monkeypatch: pytest.MonkeyPatch):
@@ -182,8 +182,8 @@ def test_components_say_what_joins_them(job: Job):
         model = first if image_id > 5 else second
         model.deregister_frame(model.image(image_id).frame_id)
     largest, other = describe_components([first, second], job)
-    assert (largest["size"], largest["photos"], largest["apart"]) == (5, [0, 1, 2, 3, 4], None)
-    assert (other["size"], other["photos"]) == (3, [5, 6, 7])
+    assert (largest["size"], largest["photos"], largest["apart"]) == (5, list(job.names[:5]), None)
+    assert (other["size"], other["photos"]) == (3, list(job.names[5:]))
     assert "pairs connect it to the largest" in other["apart"]
 
 
@@ -369,7 +369,7 @@ def test_reasons_name_the_users_photos(job: Job, monkeypatch: pytest.MonkeyPatch
     reason = "contradicts the rest: its 28.5 matches with 00001.jpg cannot be"
     monkeypatch.setattr(examine, "leave_out_contradicting", lambda model, pairs: (model, {3: reason}))
     found = examine.examine([mapped_model(job)], named)
-    assert found.left_out == {2: "contradicts the rest: its 28.5 matches with frame_00002.jpg cannot be"}
+    assert found.left_out == {named.names[2]: "contradicts the rest: its 28.5 matches with frame_00002.jpg cannot be"}
 
 
 def test_a_refusal_speaks_of_as_many_photos_as_are_missing(photos: Path, estimated: tuple[Path, PosesReport]):

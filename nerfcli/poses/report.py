@@ -85,18 +85,17 @@ def make_report(
     intrinsics: dict[str, Any] | None = None,
 ) -> PosesReport:
     """Make the report from the worker's result."""
-    models: list[list[int]] = result["models"]
+    models = [set(names) for names in result["models"]]
     images = {name: ImageReport(name, False, f"unreadable: {why}") for name, why in photos.unreadable.items()}
-    blur: dict[str, float] = result["pose_blur_px"]
-    for number, photo in enumerate(photos.photos):
+    for photo in photos.photos:
         name, orientation = photo.name, photo.exif.orientation
-        if models and number in models[0]:
-            images[name] = ImageReport(name, True, None, orientation, blur.get(str(number)))
+        if models and name in models[0]:
+            images[name] = ImageReport(name, True, None, orientation, result["pose_blur_px"].get(name))
         else:
-            elsewhere = max((len(model) for model in models[1:] if number in model), default=0)
+            elsewhere = max((len(model) for model in models[1:] if name in model), default=0)
             size_px = photo.exif.width, photo.exif.height
-            why = result["left_out"].get(str(number)) or reason(
-                **result["evidence"][number], other_model_size=elsewhere, size_px=size_px
+            why = result["left_out"].get(name) or reason(
+                **result["evidence"][name], other_model_size=elsewhere, size_px=size_px
             )
             images[name] = ImageReport(name, False, why, orientation)
     blurs = sorted((image.pose_blur_px, image.name) for image in images.values() if image.pose_blur_px is not None)
@@ -116,10 +115,6 @@ def make_report(
         if blurs
         else None,
         "intrinsics": intrinsics,
-        "components": tuple(
-            {**component, "photos": [photos.names[number] for number in component["photos"]]}
-            for component in result["components"]
-        ),
     }
     return PosesReport(**content)
 

@@ -338,10 +338,9 @@ def locate_single_photos(attempts: MappingAttempts) -> None:
     attempts.announce(what)
     grown, located = locate_photos(models[0], job, image_ids=left, report=attempts.report)
     placed = tuple(one.image_id for one in located if not one.refused)
-    names = dict(zip(job.image_ids, job.names, strict=True))
     rest = [model for model in models[1:] if not set(model.reg_image_ids()) <= set(grown.reg_image_ids())]
     attempts.take(what, [grown, *rest], job, located=(*attempts.best.located, *placed))
-    attempts.record[-1]["photos"] = [{"name": names[one.image_id], **asdict(one)} for one in located]
+    attempts.record[-1]["photos"] = [{"name": job.name_of[one.image_id], **asdict(one)} for one in located]
     attempts.located_from = attempts.best.models
 
 

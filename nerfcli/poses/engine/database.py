@@ -142,18 +142,17 @@ def feature_counts(job: Job) -> list[int]:
         return [database.num_keypoints_for_image(image_id) for image_id in job.image_ids]
 
 
-def evidence(job: Job) -> list[dict[str, Any]]:
-    """Return, per photo, its number of features, and the photo with which it has the most verified matches."""
-    best: list[tuple[int, str | None]] = [(0, None)] * len(job.files)
+def evidence(job: Job) -> dict[str, dict[str, Any]]:
+    """Return, by name, each photo's number of features, and the photo with which it has the most verified matches."""
+    best: dict[int, tuple[int, str | None]] = dict.fromkeys(job.image_ids, (0, None))
     for first, second, count in count_matches(job.database):
-        i, j = job.numbers[first], job.numbers[second]
-        for one, other in ((i, j), (j, i)):
+        for one, other in ((first, second), (second, first)):
             if count > best[one][0]:
-                best[one] = (count, job.names[other])
-    return [
-        {"features": found, "best_matches": matches, "best_partner": partner}
-        for found, (matches, partner) in zip(feature_counts(job), best, strict=True)
-    ]
+                best[one] = (count, job.name_of[other])
+    return {
+        job.name_of[image_id]: {"features": found, "best_matches": matches, "best_partner": partner}
+        for found, (image_id, (matches, partner)) in zip(feature_counts(job), best.items(), strict=True)
+    }
 
 
 def _described(camera: pycolmap.Camera) -> tuple[Any, ...]:

@@ -5,7 +5,6 @@ the training photos, and each held-out photo gets the pose that best projects th
 Nothing else changes, not by a bit: results measured on these photos depend on them only through their own poses.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -57,9 +56,8 @@ def place_held_out(job: Job, mapped: Job, result: dict[str, Any], report: Report
     as one for all photos, with "strict": how each held-out photo was placed.
     """
     folder = Path(job.folder) / "sparse" / "0"
-    whole = _renumbered(job, mapped, result)
     if not result["models"]:
-        return whole | {"left_out": {str(number): NO_MODEL for number in job.held_out}}
+        return result | {"left_out": {job.names[number]: NO_MODEL for number in job.held_out}}
     job = _with_features_and_lenses(job, mapped)
     extract(job, report)
     job = select_pairs(job, report)
@@ -68,28 +66,26 @@ def place_held_out(job: Job, mapped: Job, result: dict[str, Any], report: Report
     start_matching(job, [(i, j) for i, j in job.pairs if not {i, j} <= held_out])
     unmatched = match(job, across, report)
     model = pycolmap.Reconstruction(folder)
-    placed: dict[int, dict[str, Any]] = {}
+    placed: dict[str, dict[str, Any]] = {}
     reasons: dict[str, str] = {}
     own = (result.get("principal_points") or {"kept": False})["kept"]
     for done, number in enumerate(job.held_out):
         found = _place(model, job, number, across, own_principal_point=own)
         if isinstance(found, str):
-            reasons[str(number)] = found
+            reasons[job.names[number]] = found
         else:
-            placed[number] = found
+            placed[job.names[number]] = found
         report("map", done + 1, len(job.held_out))
     model.write_binary(folder)
-    whole["models"][0] = sorted([*whole["models"][0], *placed])
-    whole["left_out"] |= reasons
-    whole["evidence"] = evidence(job)
-    whole["pairs"] = result["pairs"] + len(across)
-    if unmatched is not None:
-        whole["cut_short"] = [*whole["cut_short"], unmatched]
-    whole["strict"] = {
-        "held_out": [job.names[number] for number in job.held_out],
-        "placed": {job.names[number]: found for number, found in placed.items()},
+    largest, *others = result["models"]
+    return result | {
+        "models": [sorted([*largest, *placed]), *others],
+        "left_out": result["left_out"] | reasons,
+        "evidence": evidence(job),
+        "pairs": result["pairs"] + len(across),
+        "cut_short": [*result["cut_short"], *([] if unmatched is None else [unmatched])],
+        "strict": {"held_out": [job.names[number] for number in job.held_out], "placed": placed},
     }
-    return whole
 
 
 def _place(
@@ -169,23 +165,3 @@ def _with_features_and_lenses(job: Job, mapped: Job) -> Job:
         max_features=mapped.max_features,
         groups=(*lenses, *job.groups[len(lenses) :]),  # cameras without a training photo are the last ones
     )
-
-
-def _renumbered(job: Job, training: Job, result: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a result of the training photos, renumbered to the photo numbers of the whole job."""
-    number = {index: job.files.index(file) for index, file in enumerate(training.files)}
-    by_number = {number[index]: of_photo for index, of_photo in enumerate(result["evidence"])}
-    nothing = {"features": 0, "best_matches": 0, "best_partner": None}
-    return {
-        **result,
-        "models": [sorted(number[index] for index in model) for model in result["models"]],
-        "evidence": [by_number.get(index, nothing) for index in range(len(job.files))],
-        "components": [
-            {**component, "photos": sorted(number[index] for index in component["photos"])}
-            for component in result["components"]
-        ],
-        **{
-            key: {str(number[int(index)]): value for index, value in result[key].items()}
-            for key in ("left_out", "pose_blur_px")
-        },
-    }

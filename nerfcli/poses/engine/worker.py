@@ -44,7 +44,7 @@ from nerfcli.poses.model.two_views import count_matches
 def describe_result(chosen: ChosenModel, job: Job) -> dict[str, Any]:
     """Describe, for the report, how the chosen model came about, and what the checks say of it."""
     mapped, examined = chosen.mapped, chosen.examined
-    placed = [] if examined.model is None else photo_numbers(examined.model, job)
+    placed = [] if examined.model is None else placed_names(examined.model, job)
     lacking = examined.details["not_computed"]  # of this model; ended attempts to map are skipped too
     return {
         "attempts": mapped.attempts,
@@ -55,18 +55,18 @@ def describe_result(chosen: ChosenModel, job: Job) -> dict[str, Any]:
         "evidence": evidence(mapped.job),
         "pairs": len(mapped.job.pairs),
         "versions": {"pycolmap": pycolmap.__version__, "ceres": pycolmap.__ceres_version__},
-        "models": [placed, *(photo_numbers(other, job) for other in mapped.models[1:])] if mapped.models else [],
-        "left_out": {str(number): reason for number, reason in examined.left_out.items()},
-        "pose_blur_px": {str(number): px for number, px in examined.blur_px.items()},
+        "models": [placed, *(placed_names(other, job) for other in mapped.models[1:])] if mapped.models else [],
+        "left_out": examined.left_out,
+        "pose_blur_px": examined.blur_px,
         "verdict": examined.verdict.to_json(),
         "components": describe_components(mapped.models, mapped.job),
         **examined.details,
     }
 
 
-def photo_numbers(model: pycolmap.Reconstruction, job: Job) -> list[int]:
-    """Return the numbers of the photos that a model places, in ascending order."""
-    return sorted(job.numbers[image_id] for image_id in model.reg_image_ids())
+def placed_names(model: pycolmap.Reconstruction, job: Job) -> list[str]:
+    """Return the sorted names of the photos that a model places."""
+    return sorted(job.name_of[image_id] for image_id in model.reg_image_ids())
 
 
 def describe_cameras(
@@ -136,27 +136,27 @@ def _model_folder(job: Job) -> Path:
 def describe_components(models: Sequence[pycolmap.Reconstruction], job: Job) -> list[dict[str, Any]]:
     """Describe each model of a job, the largest first, by the matches in the job's database.
 
-    Per model {"size", "photos": numbers, "apart": why it is not part of the largest, None for that one}.
+    Per model {"size", "photos": names, "apart": why it is not part of the largest, None for that one}.
     """
-    members = [photo_numbers(model, job) for model in models]
-    pairs = [(count, job.numbers[one], job.numbers[other]) for one, other, count in count_matches(job.database)]
+    members = [placed_names(model, job) for model in models]
+    pairs = [(count, job.name_of[one], job.name_of[other]) for one, other, count in count_matches(job.database)]
     return [
         {
             "size": len(photos),
             "photos": photos,
-            "apart": _apart(set(photos), set(members[0]), pairs, job.names) if index else None,
+            "apart": _apart(set(photos), set(members[0]), pairs) if index else None,
         }
         for index, photos in enumerate(members)
     ]
 
 
-def _apart(photos: set[int], largest: set[int], pairs: Sequence[tuple[int, int, int]], names: Sequence[str]) -> str:
+def _apart(photos: set[str], largest: set[str], pairs: Sequence[tuple[int, str, str]]) -> str:
     own = photos - largest
     between = [pair for pair in pairs if own.intersection(pair[1:]) and largest.intersection(pair[1:])]
     if not between:
         return "none of its photos matches a photo of the largest"
     count, one, other = max(between)
-    best = f"{names[one]} and {names[other]}, {count} matches"
+    best = f"{one} and {other}, {count} matches"
     strong = sum(pair[0] >= FEW_MATCHES for pair in between)
     if not strong:
         return f"no pair connects it well enough to the largest (best: {best})"
@@ -176,7 +176,7 @@ def replace_non_finite(content: Any) -> Any:
 # The last stage's file, with the data for the report. The model is beside it, in sparse/0.
 RESULT = "result.json"
 # Increased when the same models would give another result, so that scenes of earlier versions are checked again.
-_RESULT_VERSION = 3
+_RESULT_VERSION = 4
 
 
 def main(job_path: str) -> None:

@@ -139,6 +139,11 @@ class Job:
         """The photos' numbers, by id in the database."""
         return {image_id: number for number, image_id in enumerate(self.image_ids)}
 
+    @cached_property
+    def name_of(self) -> dict[int, str]:
+        """The photos' own names, by id in the database."""
+        return dict(zip(self.image_ids, self.names, strict=True))
+
     @property
     def sizes(self) -> dict[int, tuple[int, int]]:
         """Width and height of each upright photo, by id in the database."""

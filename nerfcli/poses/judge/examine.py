@@ -40,14 +40,14 @@ _ANGLE_FROM_TANGENT = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 class ExaminedModel:
     """A model after examination, with the results for the report.
 
-    left_out: why photos were left out, by number. blur_px: of each photo's pose, by number. details: for the report.
+    left_out: why photos were left out, by name. blur_px: of each photo's pose, by name. details: for the report.
     uncertainty: of the lenses, by camera id, see `lens_observability.uncertainty`.
     """
 
     model: pycolmap.Reconstruction | None
     verdict: Verdict
-    left_out: dict[int, str]
-    blur_px: dict[int, float]
+    left_out: dict[str, str]
+    blur_px: dict[str, float]
     details: dict[str, Any]
     uncertainty: dict[int, dict[str, Any]] = field(default_factory=dict)
 
@@ -98,12 +98,12 @@ def examine(
     names = dict(zip(job.files, job.names, strict=True))
     # In one pass, since a photo's own name may contain the numbered name of another one.
     reasons = {
-        job.numbers[image_id]: re.sub(r"\d+\.\w+", lambda file: names.get(file[0], file[0]), reason)
+        job.name_of[image_id]: re.sub(r"\d+\.\w+", lambda file: names.get(file[0], file[0]), reason)
         for image_id, reason in left_out.items()
     }
     details["not_computed"] = checks.not_computed
-    by_number = {job.numbers[image_id]: px for image_id, px in blur.items()}
-    return ExaminedModel(model, verdict, reasons, by_number, details, lenses.uncertainty)
+    by_name = {job.name_of[image_id]: px for image_id, px in blur.items()}
+    return ExaminedModel(model, verdict, reasons, by_name, details, lenses.uncertainty)
 
 
 def _rotation_fit(pairs: Sequence[VerifiedPair], job: Job) -> RotationFit | None:
