@@ -1,6 +1,6 @@
 """nerfcli poses: from photos to a scene."""
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -169,7 +169,7 @@ def poses(
             folder = folder_with_frames(given.path, scene.at(given.path))
             with console.stage(f"poses {folder.name}") as reporter:
                 plan = plan_scene(folder, settings, intrinsics=taken.intrinsics, reporter=reporter)
-            console.facts(given.path, plan.to_json(), f"{given.path}: {plan.describe()}")
+            console.facts(given.path, asdict(plan), f"{given.path}: {plan.describe()}")
             return
         done = estimate_poses(
             given.path,

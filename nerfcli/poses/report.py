@@ -1,7 +1,7 @@
 """Content of poses_report.json: the result for each photo."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -70,10 +70,6 @@ class PosesReport:
     moving_foreground: dict[str, Any] | None = None
     principal_points: dict[str, Any] | None = None
     cut_short: tuple[str, ...] = ()
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain lists and dictionaries."""
-        return asdict(self)
 
 
 def make_report(

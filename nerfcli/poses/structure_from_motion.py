@@ -206,7 +206,7 @@ def _describe_scene(
     given: Calibration | None,
 ) -> None:
     """Write poses_report.json and scene.json."""
-    write_json(scene_dir / "poses_report.json", report.to_json())
+    write_json(scene_dir / "poses_report.json", asdict(report))
     provenance = {"command": "poses", "settings": asdict(report.settings), "versions": report.versions}
     provenance |= {} if given is None else {"intrinsics": given.to_json()}
     provenance |= {"registered": report.registered, "total": report.total}
@@ -264,7 +264,7 @@ def _refused(error: UserError, report: PosesReport, scene_dir: Path) -> UserErro
 def _reported(error: UserError, report: PosesReport, scene_dir: Path) -> UserError:
     """Make the error for a result that does not become the scene, and keep its report."""
     path = _folder_of_refused(scene_dir) / "poses_report.json"
-    write_json(path, report.to_json())
+    write_json(path, asdict(report))
     return UserError(error.message, f"{error.hint}; details are in {path}", error.exit_code)
 
 

@@ -70,11 +70,7 @@ def placed_names(model: pycolmap.Reconstruction, job: Job) -> list[str]:
 
 
 def describe_cameras(
-    model: pycolmap.Reconstruction,
-    job: Job,
-    uncertainty: Mapping[int, dict[str, Any]],
-    *,
-    lens_of: Mapping[int, int],
+    model: pycolmap.Reconstruction, job: Job, uncertainty: Mapping[int, dict[str, Any]], *, lens_of: Mapping[int, int]
 ) -> list[dict[str, Any]]:
     """Describe, for the report, the intrinsics of the lenses of the placed photos, and their uncertainty.
 
@@ -84,18 +80,18 @@ def describe_cameras(
     photos: dict[int, list[int]] = {}
     for image_id in model.reg_image_ids():
         photos.setdefault(lens_of[image_id], []).append(image_id)
-    cameras = [(lens, camera_of_lens(model, taken), len(taken)) for lens, taken in sorted(photos.items())]
+    cameras = {lens: camera_of_lens(model, taken) for lens, taken in sorted(photos.items())}
     return [
         {
             "model": camera.model.name,
             "width": camera.width,
             "height": camera.height,
-            "params": [float(value) for value in camera.params],
+            "params": camera.params.tolist(),
             "focal_from_exif": camera.has_prior_focal_length and lens not in job.given_cameras,
-            "images": count,
+            "images": len(photos[lens]),
             "uncertainty": uncertainty.get(lens),
         }
-        for lens, camera, count in cameras
+        for lens, camera in cameras.items()
     ]
 
 
@@ -115,9 +111,8 @@ def colour_points(model: pycolmap.Reconstruction, job: Job) -> pycolmap.Reconstr
 
 def write_model(model: pycolmap.Reconstruction, job: Job) -> None:
     """Write sparse/0 into the job's folder, with the photos' own names."""
-    names = dict(zip(job.files, job.names, strict=True))
-    for image in model.images.values():
-        image.name = names[image.name]
+    for image_id, image in model.images.items():
+        image.name = job.name_of[image_id]
     folder = _model_folder(job)
     shutil.rmtree(folder, ignore_errors=True)  # left by a run that was killed before it was complete
     folder.mkdir(parents=True)
@@ -185,11 +180,11 @@ def main(job_path: str) -> None:
     pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
     job = read_job(Path(job_path))
     pycolmap.set_random_seed(job.seed)
-    solve(
-        job,
-        lambda stage, done, total: send({"stage": stage, "done": done, "total": total}),
-        lambda text: send({"note": text}),
-    )
+
+    def report(stage: str, done: int, total: int) -> None:
+        send({"stage": stage, "done": done, "total": total})
+
+    solve(job, report, lambda text: send({"note": text}))
 
 
 def solve(job: Job, report: Report, tell: Tell) -> None:
@@ -202,19 +197,17 @@ def solve(job: Job, report: Report, tell: Tell) -> None:
             name_images(job)
         return
     path.unlink(missing_ok=True)
-    seconds: dict[str, float] = {}
+    seconds = {"extract": 0.0, "match": 0.0, "map": 0.0, "check": 0.0}
     job, moving = _mask_object(job, report, tell, seconds=seconds) if stored is None else stored
     if moving is not None and moving["found"]:
         tell(describe_motions(moving))
-    result = _estimate(training_part(job) if job.held_out else job, report, tell)
+    result = _estimate(training_part(job) if job.held_out else job, report, tell, seconds=seconds)
     mapped: Job = result.pop("job")
     if job.held_out:
-        with _timed(result["seconds"], "place"):
+        with _timed(seconds, "place"):
             result = place_held_out(job, mapped, result, report)
         result["model_files"] = model_keys(job)  # these now contain the held-out photos
-    for stage, value in seconds.items():
-        result["seconds"][stage] = round(result["seconds"].get(stage, 0.0) + value, 3)
-    result["moving_foreground"] = moving
+    result |= {"moving_foreground": moving, "seconds": seconds}
     write_stage(path, result_key(job), replace_non_finite(result))
     name_images(job)
 
@@ -224,13 +217,12 @@ def result_key(job: Job) -> str:
     return stage_key(mapping_key(job), job.skipped_checks, _RESULT_VERSION)
 
 
-def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
+def _estimate(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> dict[str, Any]:
     """Map the photos, refine and accept a model, write it, and return the data for the report and "job", as mapped."""
-    seconds = {"extract": 0.0, "match": 0.0, "map": 0.0, "check": 0.0}
     mapped = _map(job, report, tell, seconds=seconds)
     with _timed(seconds, "check"):
         chosen = choose_model(mapped, report, tell)
-    result = describe_result(chosen, job) | {"seconds": seconds, "model_files": {}, "job": chosen.mapped.job}
+    result = describe_result(chosen, job) | {"model_files": {}, "job": chosen.mapped.job}
     model, uncertainty = chosen.examined.model, chosen.examined.uncertainty
     if model is None:
         return result

@@ -6,8 +6,8 @@ The seconds and bytes are those of a 2-core server; other machines are within a 
 import math
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 from nerfcli.errors import duration
 from nerfcli.poses.input.pairs import Pairing, retrieval_feature_count
@@ -67,10 +67,6 @@ class Plan:
     seconds: dict[str, float]
     features: int = 4096
     memory_bytes: int = 0
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain values."""
-        return asdict(self)
 
     def describe(self) -> str:
         """Describe the plan in one sentence."""
