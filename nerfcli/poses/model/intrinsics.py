@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 
 from nerfcli.poses.input.job import Solver
 from nerfcli.poses.model import held_out
-from nerfcli.poses.model.lens_evidence import UndeterminedError, lenses_of, parameters_of
+from nerfcli.poses.model.lens_evidence import lenses_of, parameters_of
 from nerfcli.poses.model.lens_observability import (
     DeterminedLens,
     determine_lens,
@@ -94,7 +94,7 @@ def choose_lenses(
                 found = determine_lens(
                     result, camera_id, solver, mapped=model, named=camera_id in named, exif_focal_px=exif
                 )
-            except (UndeterminedError, np.linalg.LinAlgError):
+            except np.linalg.LinAlgError:
                 if not wide:
                     continue  # `uncertainty` reports the reason
         if found is not None and found.held:

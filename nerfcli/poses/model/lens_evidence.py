@@ -35,8 +35,8 @@ _MOST_OTHERS = 12
 _DAMPING = 1e-9
 
 
-class UndeterminedError(Exception):
-    """A model has too few observations to determine its lens."""
+class UndeterminedError(np.linalg.LinAlgError):
+    """A model has too few observations to determine its lens, as where a matrix of them is singular."""
 
 
 @dataclass(frozen=True)
@@ -132,11 +132,7 @@ class Estimate:
 
 
 def lens_evidence(
-    model: pycolmap.Reconstruction,
-    camera_id: int,
-    solver: Solver = Solver(),
-    *,
-    own: OwnCameras | None = None,
+    model: pycolmap.Reconstruction, camera_id: int, solver: Solver = Solver(), *, own: OwnCameras | None = None
 ) -> LensEvidence:
     """Compute the evidence of a converged model's observations about a perspective camera.
 
@@ -147,10 +143,11 @@ def lens_evidence(
     Raises:
         UndeterminedError: there are fewer observations than unknowns.
     """
-    seen = _observations(model, lenses_of(model) if own is None else own.lens_of, seed=solver.seed)
+    own = own or OwnCameras(lenses_of(model))
+    seen = _observations(model, own.lens_of, seed=solver.seed)
     others = [c for c in seen.cameras if c != camera_id and c not in solver.fixed][:_MOST_OTHERS]
     poses, points, lens, residuals = _jacobians(model, seen, camera_id, others=others)
-    if own is not None and own.shifting:
+    if own.shifting:
         moves = np.isin(seen.photos, [seen.images.index(image_id) for image_id in own.shifting])
         moves &= (poses != 0).any(axis=(1, 2))  # of points that are projected
         poses = np.concatenate([poses, moves[:, None, None] * np.eye(2)], axis=2)
@@ -190,10 +187,8 @@ def lenses_of(model: pycolmap.Reconstruction) -> dict[int, int]:
     return {image_id: model.image(image_id).camera_id for image_id in model.reg_image_ids()}
 
 
-def camera_of(model: pycolmap.Reconstruction, lens: int, own: OwnCameras | None = None) -> pycolmap.Camera:
+def camera_of(model: pycolmap.Reconstruction, lens: int, own: OwnCameras) -> pycolmap.Camera:
     """Return the camera of a lens's first photo."""
-    if own is None:
-        return model.camera(lens)
     return model.camera(model.image(next(photo for photo, number in own.lens_of.items() if number == lens)).camera_id)
 
 

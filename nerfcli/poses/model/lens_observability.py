@@ -26,6 +26,7 @@ from nerfcli.poses.model.lens_evidence import (
     camera_with,
     lens_evidence,
     lens_values,
+    lenses_of,
     parameters_of,
 )
 
@@ -127,7 +128,7 @@ def refine_lens(model: pycolmap.Reconstruction, lens: int, own: OwnCameras, solv
     try:
         evidence = lens_evidence(model, lens, solver, own=own)
         return _camera(camera, evidence.estimate(free), named=True)
-    except (UndeterminedError, np.linalg.LinAlgError):
+    except np.linalg.LinAlgError:
         return None
 
 
@@ -147,6 +148,7 @@ def uncertainty(
         whether focal length or distortion are uncertain enough for a warning, "reason": None}. If the lens cannot be
         examined in this way or the observations are too few, "reason" says so and the numbers and "weak" are None.
     """
+    own = own or OwnCameras(lenses_of(model))
     camera = camera_of(model, camera_id, own)
     nothing = {"focal_percent": None, "principal_point_px": None, "distortion_border_px": None}
     nothing |= {"principal_point_free": principal_point, "weak": None}
@@ -159,7 +161,7 @@ def uncertainty(
         evidence = lens_evidence(model, camera_id, solver, own=own)
         found = evidence.estimate([*free, *(_PRINCIPAL_POINT if principal_point else ())])
         freed = evidence.estimate([*free, *_PRINCIPAL_POINT])
-    except (UndeterminedError, np.linalg.LinAlgError) as error:
+    except np.linalg.LinAlgError as error:
         return nothing | {"reason": str(error)}
     focal = found.deviation("f") / camera.mean_focal_length()
     border = max((_border_px(evidence, found, name) for name in free if name[0] in "kp"), default=None)
@@ -203,7 +205,7 @@ def _between_px(mapped: pycolmap.Reconstruction, camera_id: int, solver: Solver)
     focal_px, usual_px = camera.mean_focal_length(), usual_focal_px(camera.width, camera.height)
     try:
         found = lens_evidence(mapped, camera_id, solver).estimate(parameters_of(camera))
-    except (UndeterminedError, np.linalg.LinAlgError):
+    except np.linalg.LinAlgError:
         return usual_px
     weights = np.array([found.deviation("f") / focal_px, _UNKNOWN_DEVIATION]) ** -2.0
     return float(np.exp(weights @ np.log([focal_px, usual_px]) / weights.sum()))
@@ -226,7 +228,7 @@ def has_open_distortion(model: pycolmap.Reconstruction, camera_id: int, solver: 
     try:
         evidence = lens_evidence(model, camera_id, solver)
         found = evidence.estimate(["k1"])
-    except (UndeterminedError, np.linalg.LinAlgError):
+    except np.linalg.LinAlgError:
         return True
     return not _is_harmless(evidence, found, camera) and found.distance(["k1"]) <= float(chdtri(1, _CHANCE))
 
