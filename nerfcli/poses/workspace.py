@@ -109,27 +109,23 @@ def is_same_scene(
     The settings threads and accept_refused are not compared.
     """
     try:
-        return _is_same(scene_dir, photos_dir, settings, given=given)
+        report = read_json(scene_dir / "poses_report.json")
+        made = scene_dir.resolve() / read_json(scene_dir / SCENE_FILE)["image_folder"]
+        listed = list_photos(photos_dir, subfolders=settings.subfolders)
+        names = [name_in(photos_dir, path) for path in (*listed.pictures, *listed.unreadable)]
+        earlier = report.get("intrinsics")
+        files = {key: value for key, value in report["matching"].items() if key.endswith("_key")}
+        made_with = asdict(PoseSettings()) | report["settings"]  # settings newer than the report had their defaults
+        wanted = {key: value for key, value in asdict(settings).items() if key not in ("threads", "accept_refused")}
+        return (
+            made.resolve() == photos_dir.resolve()
+            and sorted(image["name"] for image in report["images"]) == sorted(names)
+            and (earlier and earlier["key"]) == (given and given.key)
+            and all(made_with[key] == value for key, value in wanted.items())
+            and files.items() <= hash_inputs(photos_dir, settings).items()
+        )
     except (OSError, ValueError, KeyError, TypeError, AttributeError, UserError):  # a file is missing or damaged
         return False
-
-
-def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: Calibration | None) -> bool:
-    report = read_json(scene_dir / "poses_report.json")
-    made = scene_dir.resolve() / read_json(scene_dir / SCENE_FILE)["image_folder"]
-    listed = list_photos(photos_dir, subfolders=settings.subfolders)
-    names = [name_in(photos_dir, path) for path in (*listed.pictures, *listed.unreadable)]
-    earlier = report.get("intrinsics")
-    files = {key: value for key, value in report["matching"].items() if key.endswith("_key")}
-    made_with = asdict(PoseSettings()) | report["settings"]  # settings newer than the report had their defaults
-    wanted = {key: value for key, value in asdict(settings).items() if key not in ("threads", "accept_refused")}
-    return (
-        made.resolve() == photos_dir.resolve()
-        and sorted(image["name"] for image in report["images"]) == sorted(names)
-        and (earlier and earlier["key"]) == (given and given.key)
-        and all(made_with[key] == value for key, value in wanted.items())
-        and files.items() <= hash_inputs(photos_dir, settings).items()
-    )
 
 
 def hash_inputs(photos_dir: Path, settings: PoseSettings) -> dict[str, str]:

@@ -12,6 +12,7 @@ known lens; so a perspective photo never gains by a fisheye.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pycolmap
@@ -209,28 +210,26 @@ def _fisheye_focal_px(group: CameraGroup, job: Job, database: pycolmap.Database)
     options.ransac.max_num_trials = 1000
     usual_px = usual_focal_px(group.width, group.height)
     camera = pycolmap.Camera.create_from_model_name(1, START_MODEL, usual_px, group.width, group.height)
-    freely = sum(_agreeing(pycolmap.estimate_two_view_geometry, camera, pair, options) for pair in pairs)
+    any_geometry = partial(pycolmap.estimate_two_view_geometry, options=options)
+    of_one_motion = partial(pycolmap.estimate_calibrated_two_view_geometry, options=options)
+    freely = sum(_agreeing(any_geometry, camera, pair) for pair in pairs)
     longer = max(group.width, group.height)
     found = []
     for focal_px in longer * _FISHEYE_FOCAL_FRACTIONS:
         start = _fisheye(group, float(focal_px))
         camera = pycolmap.Camera.create_from_model_name(1, start.model, focal_px, group.width, group.height)
         camera.params = list(start.params or ())
-        count = sum(_agreeing(pycolmap.estimate_calibrated_two_view_geometry, camera, pair, options) for pair in pairs)
-        found.append((count, float(focal_px)))
+        found.append((sum(_agreeing(of_one_motion, camera, pair) for pair in pairs), float(focal_px)))
     best, focal_px = max(found)
     return focal_px if best > _CLEARLY_MORE * freely else None
 
 
 def _agreeing(
-    estimate: Callable[..., pycolmap.TwoViewGeometry],
-    camera: pycolmap.Camera,
-    pair: tuple[Array, Array],
-    options: pycolmap.TwoViewGeometryOptions,
+    estimate: Callable[..., pycolmap.TwoViewGeometry], camera: pycolmap.Camera, pair: tuple[Array, Array]
 ) -> int:
     """Return how many of a pair's matches agree on one geometry."""
     matches = np.repeat(np.arange(len(pair[0]), dtype=np.uint32)[:, None], 2, axis=1)
-    return len(estimate(camera, pair[0], camera, pair[1], matches=matches, options=options).inlier_matches)
+    return len(estimate(camera, pair[0], camera, pair[1], matches=matches).inlier_matches)
 
 
 def _strongest_pairs(images: set[int], database: pycolmap.Database) -> list[tuple[Array, Array]]:
