@@ -18,16 +18,7 @@ from typing import Any
 import pycolmap
 
 import nerfcli
-from nerfcli.poses.input.job import (
-    Job,
-    Report,
-    file_key,
-    job_from_json,
-    read_stage,
-    repeatedly,
-    stage_key,
-    write_stage,
-)
+from nerfcli.poses.input.job import Job, Report, file_key, job_from_json, read_stage, repeatedly, stage_key, write_stage
 from nerfcli.poses.input.plan import LEAST_LIMIT_SECONDS, limit_seconds, mapping_seconds
 from nerfcli.poses.model.reasons import FEW_MATCHES
 

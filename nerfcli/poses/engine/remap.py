@@ -38,7 +38,7 @@ _LEAST_APART = 0.05
 # how busy the machine is nor on how much of the first mapping an earlier call has done.
 _LEAST_SECONDS = 60.0
 _GLOBALLY = "all photos at once (global mapper)"
-_Pairs = Set[frozenset[int]]  # of photo numbers
+_Pairs = Set[frozenset[int]]  # of image ids
 
 
 @dataclass(frozen=True)
@@ -199,13 +199,12 @@ def _consistent_part(model: pycolmap.Reconstruction, job: Job) -> tuple[pycolmap
     joins = [(a.one, a.other, -a.matches if a.contradicts else a.matches * a.fraction) for a in found]
     groups = consistent_groups(sorted(model.reg_image_ids()), joins)
     group_of = {photo: number for number, group in enumerate(groups) for photo in group}
-    place = {number: index for index, number in enumerate(capture_order(job.names) or ())}
+    place = {job.image_ids[number]: index for index, number in enumerate(capture_order(job.names) or ())}
     suspects = set()
     for a in found:
-        one, other = job.numbers[a.one], job.numbers[a.other]
-        near = bool(place) and abs(place[one] - place[other]) <= FOLLOWERS
+        near = bool(place) and abs(place[a.one] - place[a.other]) <= FOLLOWERS
         if not near and a.contradicts == (group_of[a.one] == group_of[a.other]):
-            suspects.add(frozenset((one, other)))
+            suspects.add(frozenset((a.one, a.other)))
     return without_photos(model, sorted(set(model.reg_image_ids()) - set(groups[0]))), suspects
 
 
@@ -248,7 +247,7 @@ def _copied(
     The mapper can only extend a model with the same lenses. Of an earlier copy, nothing may be left: SQLite would apply
     its write-ahead log to this one.
     """
-    kept = tuple(pair for pair in job.pairs if frozenset(pair) not in without)
+    kept = tuple(pair for pair in job.pairs if frozenset(job.image_ids[number] for number in pair) not in without)
     copy = replace(job, variant="remapped", pairs=kept)
     remove_database(copy.database)
     shutil.copyfile(job.database, copy.database)

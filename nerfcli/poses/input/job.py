@@ -135,11 +135,6 @@ class Job:
         return tuple(int(Path(file).stem) + 1 for file in self.files)
 
     @cached_property
-    def numbers(self) -> dict[int, int]:
-        """The photos' numbers, by id in the database."""
-        return {image_id: number for number, image_id in enumerate(self.image_ids)}
-
-    @cached_property
     def name_of(self) -> dict[int, str]:
         """The photos' own names, by id in the database."""
         return dict(zip(self.image_ids, self.names, strict=True))
