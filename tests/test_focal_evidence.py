@@ -155,7 +155,7 @@ def test_cameras_start_from_exif_only_where_it_holds():
     assert not any(camera.has_prior_focal_length for camera in bare)
 
 
-def test_few_cameras_are_listed_and_many_are_summed_up():
+def test_cameras_are_listed():
     def notes(exifs: list[Exif]) -> tuple[str, ...]:
         photos = [photo(f"{n}.jpg", exif, size=(exif.width, exif.height)) for n, exif in enumerate(exifs)]
         return group_photos(Photos(Path(), tuple(photos), {}), model="auto").notes
@@ -165,16 +165,9 @@ def test_few_cameras_are_listed_and_many_are_summed_up():
     assert notes([big, big, small]) == (
         "2 cameras, by EXIF and size: 2 photos of 4000x3000 (SIMPLE_RADIAL), 1 photo of 640x480 (SIMPLE_RADIAL)",
     )
-    each_its_own = [sized(NO_EXIF, 600 + n, 480) for n in range(23)]
-    assert notes(each_its_own) == (
-        "23 cameras, by EXIF and size: one photo each, 23 sizes from 600x480 to 622x480 (SIMPLE_RADIAL)",
-    )
-    zooms = [replace(CAMERA, focal_mm=float(20 * n)) for n in range(1, 6)]
-    assert notes([*zooms, *zooms]) == ("5 cameras, by EXIF and size: 2 photos each, 5472x3648 (SIMPLE_RADIAL)",)
-    fisheye = replace(zooms[0], lens="8mm Fisheye")
-    assert notes([*zooms, *zooms, fisheye]) == (
-        "6 cameras, by EXIF and size: 1 to 2 photos each, 5472x3648 (5 SIMPLE_RADIAL, 1 OPENCV_FISHEYE)",
-    )
+    (note,) = notes([replace(CAMERA, lens="8mm Fisheye"), *(sized(NO_EXIF, 600 + n, 480) for n in range(22))])
+    assert note.startswith("23 cameras, by EXIF and size: 1 photo of 5472x3648 (OPENCV_FISHEYE), 1 photo of 600x480 (")
+    assert note.endswith("1 photo of 604x480 (SIMPLE_RADIAL) and 17 more")
 
 
 def test_doubts_about_exif_are_one_note_for_a_reason_and_few_in_all():

@@ -1,13 +1,12 @@
 """Groups of photos with a common camera, and initial intrinsics: from EXIF and size, or as given."""
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from nerfcli.captures.calibration import Calibration, PhotoCalibration, calibrated
 from nerfcli.captures.orientation import Picture, counted, describe_rescaling, rescaling
-from nerfcli.errors import UserError, several
+from nerfcli.errors import UserError, listed, several
 from nerfcli.photos.exif import Exif
 from nerfcli.photos.focal_evidence import focal_evidence
 from nerfcli.photos.panoramas import MOST_OF_A_CAMERA, PANORAMA
@@ -15,8 +14,8 @@ from nerfcli.poses.input.job import CameraGroup
 from nerfcli.poses.input.photos import Photo, Photos, camera_groups
 from nerfcli.poses.model.intrinsics import START_FISHEYE, START_MODEL
 
-# Up to this many cameras are listed one by one.
-_MOST_LISTED = 4
+# More reasons to doubt EXIF than this are only counted.
+_MOST_DOUBTS = 4
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,8 @@ def group_photos(photos: Photos, *, model: str) -> PhotoGroups:
     if len(groups) == 1:
         return PhotoGroups(tuple(groups), notes)
     by = "folder, EXIF and size" if any("/" in name for name in photos.names) else "EXIF and size"
-    return PhotoGroups(tuple(groups), (f"{len(groups)} cameras, by {by}: {_summary(groups)}", *notes))
+    each = listed([f"{several(len(g.photos), 'photo')} of {g.width}x{g.height} ({g.model})" for g in groups])
+    return PhotoGroups(tuple(groups), (f"{len(groups)} cameras, by {by}: {each}", *notes))
 
 
 def _panoramas(photos: tuple[int, ...], first: Photo) -> CameraGroup:
@@ -126,28 +126,11 @@ def _panorama_notes(groups: Sequence[CameraGroup], *, chosen: bool) -> tuple[str
 def _doubts(doubted: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     """Return a note for each reason to doubt EXIF; if there are many, for the first ones and the number of the rest."""
     notes = []
-    for doubt, names in list(doubted.items())[:_MOST_LISTED]:
+    for doubt, names in list(doubted.items())[:_MOST_DOUBTS]:
         which = names[0] if len(names) == 1 else f"{names[0]} and {several(len(names) - 1, 'more photo')}"
         notes.append(f"EXIF's focal length is only a starting value for {which}: {doubt}")
-    rest = sum(len(names) for names in list(doubted.values())[_MOST_LISTED:])
+    rest = sum(len(names) for names in list(doubted.values())[_MOST_DOUBTS:])
     return (*notes, f"and for {several(rest, 'more photo')}, for reasons like these") if rest else tuple(notes)
-
-
-def _summary(groups: Sequence[CameraGroup]) -> str:
-    """Describe the cameras one by one if they are few, else by their numbers of photos, sizes and models."""
-    counts = [len(group.photos) for group in groups]
-    if len(groups) <= _MOST_LISTED:
-        return ", ".join(f"{several(len(g.photos), 'photo')} of {g.width}x{g.height} ({g.model})" for g in groups)
-    each = "one photo" if max(counts) == 1 else f"{min(counts)} to {max(counts)} photos"
-    if min(counts) == max(counts) > 1:
-        each = f"{max(counts)} photos"
-    sizes = sorted({(group.width, group.height) for group in groups}, key=lambda size: (size[0] * size[1], size))
-    of_size = "{}x{}".format(*sizes[-1])
-    if len(sizes) > 1:
-        of_size = f"{len(sizes)} sizes from {'{}x{}'.format(*sizes[0])} to {of_size}"
-    models = Counter(group.model for group in groups).most_common()
-    of_model = ", ".join(name if len(models) == 1 else f"{count} {name}" for name, count in models)
-    return f"{each} each, {of_size} ({of_model})"
 
 
 def _notes(calibration: Calibration, found: Sequence[PhotoCalibration]) -> tuple[str, ...]:
