@@ -69,9 +69,8 @@ def occluder_masks(
 
         def mask_of(index: int) -> np.ndarray:
             near = np.argsort(np.linalg.norm(centres - centres[index], axis=1), kind="stable")[1 : OTHERS + 1]
-            mask = _hidden(small[index], [small[other] for other in near.tolist()])
-            height, width = photos[index].pixels.shape[:2]
-            return cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST).astype(bool)
+            mask = _hidden(small[index], [small[other] for other in near.tolist()]).astype(np.uint8)
+            return cv2.resize(mask, photos[index].frame.camera.size, interpolation=cv2.INTER_NEAREST) > 0
 
         return list(pool.map(mask_of, range(len(photos))))
 

@@ -51,11 +51,9 @@ def sky_masks(photos: Sequence[LoadedPhoto], *, threads: int) -> list[np.ndarray
             same_way = np.flatnonzero(views @ views[index] > SAME_WAY_COS)
             same_way = same_way[same_way != index]
             chosen = np.unique(np.linspace(0, len(same_way) - 1, OTHERS).round().astype(int)) if len(same_way) else []
-            mask = _up_to_its_border(
-                small[index], _agreed(small[index], [small[other] for other in same_way[chosen]], up)
-            )
-            height, width = photos[index].pixels.shape[:2]
-            return cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST).astype(bool)
+            agreed = _agreed(small[index], [small[other] for other in same_way[chosen]], up)
+            mask = _up_to_its_border(small[index], agreed).astype(np.uint8)
+            return cv2.resize(mask, photos[index].frame.camera.size, interpolation=cv2.INTER_NEAREST) > 0
 
         return list(pool.map(mask_of, range(len(photos))))
 
@@ -117,7 +115,7 @@ class _Small:
         camera = photo.frame.camera
         scale = min(1.0, LONGER_SIDE_PX / max(camera.width, camera.height))
         self.camera = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-        size = (self.camera.width, self.camera.height)
+        size = self.camera.size
         colours = np.ascontiguousarray(photo.pixels[..., :3])
         levels = cv2.resize(colours, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         window = (WINDOW_PX, WINDOW_PX)

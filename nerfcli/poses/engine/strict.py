@@ -6,7 +6,6 @@ Nothing else changes, not by a bit: results measured on these photos depend on t
 """
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -55,7 +54,6 @@ def place_held_out(job: Job, mapped: Job, result: dict[str, Any], report: Report
     Returns the worker's result for `mapped`, the `training_part` of the job with the features and lenses of the model,
     as one for all photos, with "strict": how each held-out photo was placed.
     """
-    folder = Path(job.folder) / "sparse" / "0"
     if not result["models"]:
         return result | {"left_out": {job.names[number]: NO_MODEL for number in job.held_out}}
     job = _with_features_and_lenses(job, mapped)
@@ -65,7 +63,7 @@ def place_held_out(job: Job, mapped: Job, result: dict[str, Any], report: Report
     across = tuple((i, j) for i, j in job.pairs if (i in held_out) != (j in held_out))
     start_matching(job, [(i, j) for i, j in job.pairs if not {i, j} <= held_out])
     unmatched = match(job, across, report)
-    model = pycolmap.Reconstruction(folder)
+    model = pycolmap.Reconstruction(job.model_folder)
     placed: dict[str, dict[str, Any]] = {}
     reasons: dict[str, str] = {}
     own = (result.get("principal_points") or {"kept": False})["kept"]
@@ -76,7 +74,7 @@ def place_held_out(job: Job, mapped: Job, result: dict[str, Any], report: Report
         else:
             placed[job.names[number]] = found
         report("map", done + 1, len(job.held_out))
-    model.write_binary(folder)
+    model.write_binary(job.model_folder)
     largest, *others = result["models"]
     return result | {
         "models": [sorted([*largest, *placed]), *others],

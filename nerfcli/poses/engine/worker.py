@@ -46,12 +46,10 @@ def describe_result(chosen: ChosenModel, job: Job) -> dict[str, Any]:
     mapped, examined = chosen.mapped, chosen.examined
     placed = [] if examined.model is None else placed_names(examined.model, job)
     lacking = examined.details["not_computed"]  # of this model; ended attempts to map are skipped too
+    ended = [f"{what}: {why}" for what, why in job.skipped_checks if what not in lacking]
     return {
         "attempts": mapped.attempts,
-        "cut_short": [
-            *mapped.cut_short,
-            *(f"{what}: {why}" for what, why in job.skipped_checks if what not in lacking),
-        ],
+        "cut_short": [*mapped.cut_short, *ended],
         "evidence": evidence(mapped.job),
         "pairs": len(mapped.job.pairs),
         "versions": {"pycolmap": pycolmap.__version__, "ceres": pycolmap.__ceres_version__},
@@ -113,19 +111,9 @@ def write_model(model: pycolmap.Reconstruction, job: Job) -> None:
     """Write sparse/0 into the job's folder, with the photos' own names."""
     for image_id, image in model.images.items():
         image.name = job.name_of[image_id]
-    folder = _model_folder(job)
-    shutil.rmtree(folder, ignore_errors=True)  # left by a run that was killed before it was complete
-    folder.mkdir(parents=True)
-    model.write_binary(folder)
-
-
-def model_keys(job: Job) -> dict[str, str]:
-    """Return a hash of each file of the model in the job's folder, by the file's name; none if there is no model."""
-    return file_keys(_model_folder(job))
-
-
-def _model_folder(job: Job) -> Path:
-    return Path(job.folder) / "sparse" / "0"
+    shutil.rmtree(job.model_folder, ignore_errors=True)  # left by a run that was killed before it was complete
+    job.model_folder.mkdir(parents=True)
+    model.write_binary(job.model_folder)
 
 
 def describe_components(models: Sequence[pycolmap.Reconstruction], job: Job) -> list[dict[str, Any]]:
@@ -135,14 +123,8 @@ def describe_components(models: Sequence[pycolmap.Reconstruction], job: Job) -> 
     """
     members = [placed_names(model, job) for model in models]
     pairs = [(count, job.name_of[one], job.name_of[other]) for one, other, count in count_matches(job.database)]
-    return [
-        {
-            "size": len(photos),
-            "photos": photos,
-            "apart": _apart(set(photos), set(members[0]), pairs) if index else None,
-        }
-        for index, photos in enumerate(members)
-    ]
+    apart = [None, *(_apart(set(photos), set(members[0]), pairs) for photos in members[1:])]
+    return [{"size": len(photos), "photos": photos, "apart": why} for photos, why in zip(members, apart, strict=False)]
 
 
 def _apart(photos: set[str], largest: set[str], pairs: Sequence[tuple[int, str, str]]) -> str:
@@ -192,7 +174,7 @@ def solve(job: Job, report: Report, tell: Tell) -> None:
     stored = recall_masks(job)
     path, key = Path(job.folder) / RESULT, result_key(job if stored is None else stored[0])
     there = read_stage(path, key)
-    if there is not None and there["model_files"].items() <= model_keys(job).items():
+    if there is not None and there["model_files"].items() <= file_keys(job.model_folder).items():
         if job.database.exists():
             name_images(job)
         return
@@ -206,7 +188,7 @@ def solve(job: Job, report: Report, tell: Tell) -> None:
     if job.held_out:
         with _timed(seconds, "place"):
             result = place_held_out(job, mapped, result, report)
-        result["model_files"] = model_keys(job)  # these now contain the held-out photos
+        result["model_files"] = file_keys(job.model_folder)  # these now contain the held-out photos
     result |= {"moving_foreground": moving, "seconds": seconds}
     write_stage(path, result_key(job), replace_non_finite(result))
     name_images(job)
@@ -240,7 +222,7 @@ def _estimate(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]
         "cameras": describe_cameras(model, job, uncertainty, lens_of=lens_of),
         "mean_reprojection_error_px": model.compute_mean_reprojection_error(),
         "points": model.num_points3D(),
-        "model_files": model_keys(job),
+        "model_files": file_keys(job.model_folder),
     }
 
 

@@ -109,6 +109,11 @@ class Job:
         """Folder of the masks, named after the photos' files with .png appended."""
         return Path(self.folder) / "masks"
 
+    @property
+    def model_folder(self) -> Path:
+        """Folder of the model that becomes the scene's."""
+        return Path(self.folder) / "sparse" / "0"
+
     def stage_file(self, name: str) -> Path:
         """Return the path of a stage on the way to the database."""
         return Path(self.folder) / f"{self.variant}{'-' if self.variant else ''}{name}.json"

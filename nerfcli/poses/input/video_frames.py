@@ -256,20 +256,16 @@ def _different(
     frames: Iterator[tuple[int, np.ndarray]], measures: Sequence[FrameMeasure]
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the frames without repetitions: of a run of frames that show the same, only the sharpest."""
-    step = smallest_step(measures)
-    best: tuple[int, np.ndarray] | None = None
-    first: MotionPicture | None = None
+    step, best = smallest_step(measures), next(frames)
+    first = MotionPicture(best[1])
     for number, picture in frames:
         motion = MotionPicture(picture)
-        if best is not None and first is not None and first.moved_to(motion) < step:
-            if measures[number].sharpness > measures[best[0]].sharpness:
-                best = number, picture
-            continue
-        if best is not None:
+        if first.moved_to(motion) >= step:
             yield best
-        best, first = (number, picture), motion
-    if best is not None:
-        yield best
+            best, first = (number, picture), motion
+        elif measures[number].sharpness > measures[best[0]].sharpness:
+            best = number, picture
+    yield best
 
 
 def _kept(folder: Path, path: Path, request: dict[str, Any], *, overwrite: bool, note: Notify) -> bool:

@@ -145,7 +145,7 @@ def lens_evidence(
     """
     own = own or OwnCameras(lenses_of(model))
     seen = _observations(model, own.lens_of, seed=solver.seed)
-    others = [c for c in seen.cameras if c != camera_id and c not in solver.fixed][:_MOST_OTHERS]
+    others = [c for c in sorted(set(seen.lenses)) if c != camera_id and c not in solver.fixed][:_MOST_OTHERS]
     poses, points, lens, residuals = _jacobians(model, seen, camera_id, others=others)
     if own.shifting:
         moves = np.isin(seen.photos, [seen.images.index(image_id) for image_id in own.shifting])
@@ -207,12 +207,11 @@ def parameters_of(camera: pycolmap.Camera) -> tuple[str, ...]:
 class _Seen:
     """Observations: photos and points (n,) are positions in `images` and `xyz`; pixels (n, 2).
 
-    lenses: the lens of each of the images. cameras: all lenses.
+    lenses: the lens of each of the images.
     """
 
     images: list[int]
     lenses: list[int]
-    cameras: list[int]
     photos: NDArray[np.int64]
     points: NDArray[np.int64]
     pixels: Array
@@ -232,11 +231,9 @@ def _observations(model: pycolmap.Reconstruction, lens_of: Mapping[int, int], *,
         for point in model.image(image_id).get_observation_points2D()
         if point.point3D_id in places
     ]
-    lenses = [lens_of[image_id] for image_id in images]
     return _Seen(
         images,
-        lenses,
-        sorted(set(lenses)),
+        lenses=[lens_of[image_id] for image_id in images],
         photos=np.array([photo for photo, _, _ in seen], dtype=np.int64),
         points=np.array([point for _, point, _ in seen], dtype=np.int64),
         pixels=np.array([pixel for _, _, pixel in seen], dtype=np.float64).reshape(-1, 2),

@@ -156,9 +156,8 @@ def shared_pairs(model: pycolmap.Reconstruction, image_ids: Sequence[int], *, mi
                 if element.image_id != image_id:
                     there = model.image(element.image_id).points2D[element.point2D_idx]
                     both = (seen.xy, there.xy) if image_id < element.image_id else (there.xy, seen.xy)
-                    pixels.setdefault((min(image_id, element.image_id), max(image_id, element.image_id)), []).append(
-                        both
-                    )
+                    pair = min(image_id, element.image_id), max(image_id, element.image_id)
+                    pixels.setdefault(pair, []).append(both)
     return [
         VerifiedPair(*pair, np.array([one for one, _ in both]), np.array([other for _, other in both]))
         for pair, both in sorted(pixels.items())
