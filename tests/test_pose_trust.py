@@ -676,19 +676,20 @@ def test_a_camera_whose_photos_are_not_registered_is_no_error(tmp_path: Path):
     assert sum("was not used" in note for note in notes) == 1
 
 
-def test_a_given_initial_pair_is_tried_once(solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.fixture
+def used(monkeypatch: pytest.MonkeyPatch) -> list[pycolmap.IncrementalPipelineOptions]:
+    """The options with which a mapper is run that gives no model."""
+    found: list[pycolmap.IncrementalPipelineOptions] = []
+    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_, options, **others: found.append(options) or {})
+    return found
+
+
+def test_a_given_initial_pair_is_tried_once(solved: Solved, tmp_path: Path, used):
     """pycolmap tries an unsuitable one again 200 times at each of five thresholds, with the same result."""
     job = job_again(solved, tmp_path / "again")
-    trials: list[int] = []
-
-    def mapping(*arguments, options: pycolmap.IncrementalPipelineOptions, **others) -> dict[int, object]:
-        trials.append(options.init_num_trials)
-        return {}
-
-    monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
     for number, start in enumerate((MapperOptions(init_pair=(1, 2)), MapperOptions())):
         map_photos(job, lambda *progress: None, attempt=50 + number, start=start)
-    assert trials == [1, 200]
+    assert [options.init_num_trials for options in used] == [1, 200]
 
 
 @pytest.mark.parametrize(
@@ -696,17 +697,9 @@ def test_a_given_initial_pair_is_tried_once(solved: Solved, tmp_path: Path, monk
     [(0, 100, 3000, True, 1.1), (1, 100, 3000, False, 1.1), (1, 10, 3000, True, 1.1), (0, 100, 0, True, 1.3)],
 )
 def test_first_attempts_and_those_of_many_photos_are_rough(
-    solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, attempt: int, many: int, dense: int, rough: bool,
-    growth: float,
-):  # fmt: skip
+    solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, used, attempt, many, dense, rough, growth
+):
     """Ten photos; global adjustments are fewer where photos have more matches than `dense`."""
-    used: list[pycolmap.IncrementalPipelineOptions] = []
-
-    def mapping_of(*arguments, options: pycolmap.IncrementalPipelineOptions, **others) -> dict[int, object]:
-        used.append(options)
-        return {}
-
-    monkeypatch.setattr(pycolmap, "incremental_mapping", mapping_of)
     monkeypatch.setattr(mapping, "_MANY_PHOTOS", many)
     monkeypatch.setattr(mapping, "_DENSE", dense)
     map_photos(job_again(solved, tmp_path / "again"), lambda *progress: None, attempt=attempt, start=MapperOptions())

@@ -301,6 +301,15 @@ def job(capture: Turntable, tmp_path: Path) -> Job:
     return made
 
 
+def interrupted_masking(job: Job) -> None:
+    """Make masks that are all white, and be interrupted where the first one is written for pycolmap."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(still, "enlarged", lambda mask, size: np.ones(size[::-1], bool))
+        patched.setattr(module, "write_mask", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            mask_turning_object(job, lambda note: None)
+
+
 class TestPoses:
     def test_object_is_solved_as_if_the_camera_went_around_it(
         self, capture: Turntable, made: tuple[Path, dict, list[str]]
@@ -407,11 +416,7 @@ class TestPoses:
 
     def test_masks_of_a_run_that_was_interrupted_are_not_taken_for_edited_ones(self, job: Job) -> None:
         expected = mask_turning_object(job, lambda note: None)[0].masks
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(still, "enlarged", lambda mask, size: np.ones(size[::-1], bool))
-            patched.setattr(module, "write_mask", Mock(side_effect=KeyboardInterrupt))
-            with pytest.raises(KeyboardInterrupt):
-                mask_turning_object(job, lambda note: None)
+        interrupted_masking(job)
         assert np.asarray(Image.open(scene_masks(job) / f"{job.names[0]}.png")).all()
         assert mask_turning_object(job, lambda note: None)[0].masks == expected
 
@@ -438,17 +443,14 @@ class TestPoses:
         assert facts["unmasked"] == [job.names[0]]
         assert path.read_bytes() == edited
 
-    def test_a_photo_that_gets_no_mask_has_none_of_a_run_that_was_interrupted(self, job: Job) -> None:
+    def test_a_photo_that_gets_no_mask_has_none_of_a_run_that_was_interrupted(
+        self, job: Job, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         """The first mask was written by that run, the last one before it."""
+        interrupted_masking(job)
         make = module._make_masks
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(still, "enlarged", lambda mask, size: np.ones(size[::-1], bool))
-            patched.setattr(module, "write_mask", Mock(side_effect=KeyboardInterrupt))
-            with pytest.raises(KeyboardInterrupt):
-                mask_turning_object(job, lambda note: None)
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(module, "_make_masks", lambda *some, **more: [None, *make(*some, **more)[1:-1], None])
-            mask_turning_object(job, lambda note: None)
+        monkeypatch.setattr(module, "_make_masks", lambda *some, **more: [None, *make(*some, **more)[1:-1], None])
+        mask_turning_object(job, lambda note: None)
         there = [(scene_masks(job) / f"{name}.png").exists() for name in job.names]
         assert there == [False] + [True] * (len(job.names) - 2) + [False]
 
