@@ -363,15 +363,6 @@ def test_photos_without_features_and_a_failing_search_for_motions_end_nothing(
     assert f"could not check for an object moving in front of a static background: {why}" in notes
 
 
-def test_reasons_name_the_users_photos(job: Job, monkeypatch: pytest.MonkeyPatch):
-    """The photo stored as 00001.jpg is called frame_00002.jpg, which contains the stored name of the next photo."""
-    named = replace(job, names=tuple(f"frame_{number + 1:05d}.jpg" for number in range(8)))
-    reason = "contradicts the rest: its 28.5 matches with 00001.jpg cannot be"
-    monkeypatch.setattr(examine, "leave_out_contradicting", lambda model, pairs: (model, {3: reason}))
-    found = examine.examine([mapped_model(job)], named)
-    assert found.left_out == {named.names[2]: "contradicts the rest: its 28.5 matches with frame_00002.jpg cannot be"}
-
-
 def test_a_refusal_speaks_of_as_many_photos_as_are_missing(photos: Path, estimated: tuple[Path, PosesReport]):
     _, report = estimated
     there = [replace(image, registered=True, reason=None) for image in report.images[:4]]

@@ -83,7 +83,7 @@ def test_a_photo_without_any_pair_is_placed_where_it_was_taken(tmp_path: Path, a
     # No verified pair holds it, yet the check for contradictions does not remove it.
     held = shared_pairs(grown, [LAST], min_matches=15)
     assert {pair.other for pair in held} == {LAST}
-    assert leave_out_contradicting(grown, held)[1] == {}
+    assert leave_out_contradicting(grown, held, job.name_of)[1] == {}
 
 
 def test_a_photo_of_something_else_is_not_placed(tmp_path: Path):

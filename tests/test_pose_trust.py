@@ -147,12 +147,14 @@ def test_a_wrong_result_with_low_residuals_is_refused(solved: Solved):
     wrong = synthetic.bent(solved.model, 6)
     assert wrong.compute_mean_reprojection_error() < 1.05 * solved.model.compute_mean_reprojection_error()
     pairs = read_verified_pairs(solved.job.database, min_matches=15)
-    same, left_out = leave_out_contradicting(wrong, pairs)
+    job = replace(solved.job, names=tuple(f"kitchen {number}.jpg" for number in range(10)))
+    same, left_out = leave_out_contradicting(wrong, pairs, job.name_of)
     assert same is wrong
     assert left_out == {}
-    verdict = judge(wrong, pairs, solved.job)
+    verdict = judge(wrong, pairs, job)
     assert verdict.failures[0].kind == "the poses contradict the strongest matches"
-    assert "verified matches between" in verdict.failures[0].evidence
+    assert "verified matches between kitchen " in verdict.failures[0].evidence
+    assert {verdict.measures["strong_contradictions"][0][end] for end in ("one", "other")} < set(job.names)
 
 
 def job_again(solved: Solved, folder: Path) -> Job:
@@ -448,9 +450,12 @@ def test_one_photo_that_contradicts_is_left_out(solved: Solved):
     """A tenth of the photos; the others are accepted."""
     wrong = synthetic.bent(solved.model, 10)
     pairs = read_verified_pairs(solved.job.database, min_matches=15)
-    rest, left_out = leave_out_contradicting(wrong, pairs)
+    rest, left_out = leave_out_contradicting(
+        wrong, pairs, {image_id: f"kitchen {image_id}.jpg" for image_id in range(11)}
+    )
     assert set(left_out) == {10}
     assert left_out[10].startswith("contradicts the rest: its ")
+    assert "matches with kitchen " in left_out[10]
     assert rest.num_reg_images() == 9
     assert judge(rest, pairs, solved.job).accepted
 
@@ -461,7 +466,7 @@ def test_a_photo_far_from_all_others_is_left_out(solved: Solved):
     pose = wrong.image(10).cam_from_world()
     frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([0.0, 0.0, 300.0]))
     pairs = read_verified_pairs(solved.job.database, min_matches=15)
-    rest, left_out = leave_out_contradicting(wrong, pairs)
+    rest, left_out = leave_out_contradicting(wrong, pairs, solved.job.name_of)
     assert rest.num_reg_images() == 9
     assert "times as far away as the other cameras" in left_out[10]
 
@@ -509,12 +514,12 @@ def test_a_photo_from_much_farther_away_stays_if_its_matches_determine_its_place
     points = np.column_stack([rng.uniform(-1, 1, 300), rng.uniform(1.5, 2.5, 300), rng.uniform(-0.7, 0.7, 300)])
     back = np.array([0.15, -7.0, 0.3])
     views = [*side_by_side(7), View(WIDE, synthetic.looking_at(back, back + np.array([0.0, 1.0, 0.0])))]
-    pairs = common_pixels(views, points, noise_px=0.5)
-    assert leave_out_contradicting(synthetic.true_model(views), pairs)[1] == {}
+    pairs, names = common_pixels(views, points, noise_px=0.5), dict(enumerate("abcdefgh", start=1))
+    assert leave_out_contradicting(synthetic.true_model(views), pairs, names)[1] == {}
     # A sky says nothing about where it is seen from.
     sky = points * 1e4
     held_by_sky = [*common_pixels(views[:-1], points, noise_px=0.5), *common_pixels(views, sky, noise_px=0.5)]
-    assert list(leave_out_contradicting(synthetic.true_model(views), held_by_sky)[1]) == [8]
+    assert list(leave_out_contradicting(synthetic.true_model(views), held_by_sky, names)[1]) == [8]
 
 
 def test_a_scene_that_repeats_itself_is_recognised(tmp_path: Path):

@@ -96,7 +96,9 @@ def judge(
         "rotations of pairs", lambda: rotation_errors(model, pairs, job.solver), otherwise=[]
     )
     contradictions: list[Contradiction] = run(
-        "contradictions", lambda: strong_contradictions(model, [*found, *agreements(model, held)]), otherwise=[]
+        "contradictions",
+        lambda: strong_contradictions(model, [*found, *agreements(model, held)], job.name_of),
+        otherwise=[],
     )
     total = sum(a.matches for a in found)
     fraction = sum(c.matches for c in contradictions) / total if total else 0.0
@@ -121,7 +123,7 @@ def judge(
     }
     failures = [
         *_no_baseline(turn, geometry, unused["median_px"]),
-        *_contradicted(contradictions, fraction, found, names=dict(zip(job.files, job.names, strict=True))),
+        *_contradicted(contradictions, fraction, found),
         *_turned(measures["rotations"]),
         *_implausible(model, measures, given=job.given_cameras, determined=determined),
     ]
@@ -224,11 +226,7 @@ def _no_baseline(turn: RotationFit | None, geometry: Mapping[str, Any], held_out
 
 
 def _contradicted(
-    contradictions: Sequence[Contradiction],
-    fraction: float,
-    found: Sequence[PairAgreement],
-    *,
-    names: Mapping[str, str],
+    contradictions: Sequence[Contradiction], fraction: float, found: Sequence[PairAgreement]
 ) -> list[Failure]:
     rivals = sum(c.matches for c in contradictions if c.is_rival)
     outweighing = [c for c in contradictions if c.outweighs]
@@ -243,9 +241,8 @@ def _contradicted(
     elif outweighing:
         kind = "the poses contradict the strongest matches"
         first = outweighing[0]
-        between = " and ".join(names.get(name, name) for name in (first.one, first.other))
         also = f" and {len(outweighing) - 1} more pairs" if len(outweighing) > 1 else ""
-        matches = f"the {first.matches} verified matches between {between}"
+        matches = f"the {first.matches} verified matches between {first.one} and {first.other}"
         evidence = f"{matches} are inconsistent with the estimated poses{also}"
         advice = "take more photos between these two, with more overlap"
     else:

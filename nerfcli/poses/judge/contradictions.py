@@ -1,6 +1,6 @@
 """Find the verified pairs of photos that contradict a model, and leave out the photos on the weaker side."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,17 +41,17 @@ class Contradiction:
 
 
 def leave_out_contradicting(
-    model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair]
+    model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], names: Mapping[int, str]
 ) -> tuple[pycolmap.Reconstruction, dict[int, str]]:
     """Return the model without the photos that the strongest evidence contradicts, and the reasons by image id.
 
     Photos are connected by their pairs. If the strongest chain of pairs contains one that contradicts the model, the
     smaller side may be anywhere. If all such sides together have few photos, these are left out; if they have many, the
-    model is not repaired but returned unchanged, to be refused.
+    model is not repaired but returned unchanged, to be refused. `names` are those of the photos, by image id.
     """
     found = agreements(model, pairs)
     placed = sorted(model.reg_image_ids())
-    contradicting = [c for c in strong_contradictions(model, found) if c.outweighs]
+    contradicting = [c for c in strong_contradictions(model, found, names) if c.outweighs]
     far = {photo: reason for photo, reason in _far_away(model).items() if not _is_held(photo, found)}
     if not contradicting and not far:
         return model, {}
@@ -60,11 +60,11 @@ def leave_out_contradicting(
     _, *sides = connected_groups(placed, [pair for pair in tree if pair in agreeing]) if contradicting else [placed]
     reasons = dict(far)
     for photo in (photo for side in sides for photo in side if photo not in far):
-        pair = next((c for c in contradicting if model.image(photo).name in (c.one, c.other)), None)
+        pair = next((c for c in contradicting if names[photo] in (c.one, c.other)), None)
         if pair is None:
             reasons[photo] = "connected to the rest only through a photo that contradicts it"
         else:
-            other = pair.other if pair.one == model.image(photo).name else pair.one
+            other = pair.other if pair.one == names[photo] else pair.one
             reasons[photo] = (
                 f"contradicts the rest: its {pair.matches} matches with {other} are inconsistent with the poses"
             )
@@ -82,7 +82,9 @@ def without_photos(model: pycolmap.Reconstruction, photos: Iterable[int] = ()) -
     return rest
 
 
-def strong_contradictions(model: pycolmap.Reconstruction, found: Sequence[PairAgreement]) -> list[Contradiction]:
+def strong_contradictions(
+    model: pycolmap.Reconstruction, found: Sequence[PairAgreement], names: Mapping[int, str]
+) -> list[Contradiction]:
     """Return pairs that contradict a model, more than half as strong as the chain that supports it, strongest first."""
     chain_between = bottlenecks(
         sorted(model.reg_image_ids()), [(a.one, a.other, a.matches * a.fraction) for a in found if not a.contradicts]
@@ -91,7 +93,7 @@ def strong_contradictions(model: pycolmap.Reconstruction, found: Sequence[PairAg
     for a in sorted((a for a in found if a.contradicts), key=lambda a: -a.matches):
         chain = chain_between(a.one, a.other)
         if a.matches > _RIVAL_STRENGTH * chain:
-            pairs.append(Contradiction(model.image(a.one).name, model.image(a.other).name, a.matches, chain))
+            pairs.append(Contradiction(names[a.one], names[a.other], a.matches, chain))
     return pairs
 
 

@@ -9,7 +9,6 @@ Letters: R, t is a camera's pose from the world, C its centre. A pose's six unkn
 camera's axes, and the change of t; J maps them to pixels; a similarity has theta, tau, s as its seven.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -82,7 +81,9 @@ def examine(
         "points of single photos", lambda: shared_pairs(mapped, single, min_matches=MIN_MATCHES), otherwise=[]
     )
     model, left_out = checks.run(
-        "contradicting photos", lambda: leave_out_contradicting(mapped, [*pairs, *held]), otherwise=(mapped, {})
+        "contradicting photos",
+        lambda: leave_out_contradicting(mapped, [*pairs, *held], job.name_of),
+        otherwise=(mapped, {}),
     )
     report("check", 1, 4)
     lenses = checks.run("lens models", lambda: _with_lenses(model, job), otherwise=ModelLenses(model, {}))
@@ -95,15 +96,10 @@ def examine(
     if verdict.accepted and model.num_reg_images() <= 500:  # with more photos, the joint covariance takes minutes
         blur = checks.run("pose uncertainty", lambda: pose_blur_px(model, job.solver), otherwise=blur)
     report("check", 4, 4)
-    names = dict(zip(job.files, job.names, strict=True))
-    # In one pass, since a photo's own name may contain the numbered name of another one.
-    reasons = {
-        job.name_of[image_id]: re.sub(r"\d+\.\w+", lambda file: names.get(file[0], file[0]), reason)
-        for image_id, reason in left_out.items()
-    }
     details["not_computed"] = checks.not_computed
-    by_name = {job.name_of[image_id]: px for image_id, px in blur.items()}
-    return ExaminedModel(model, verdict, reasons, by_name, details, lenses.uncertainty)
+    reasons = {job.name_of[image_id]: reason for image_id, reason in left_out.items()}
+    blur_px = {job.name_of[image_id]: px for image_id, px in blur.items()}
+    return ExaminedModel(model, verdict, reasons, blur_px, details, lenses.uncertainty)
 
 
 def _rotation_fit(pairs: Sequence[VerifiedPair], job: Job) -> RotationFit | None:
