@@ -162,10 +162,7 @@ def _map(view: View, others: Sequence[View], points: np.ndarray) -> tuple[np.nda
 
 
 def _depth(
-    photo: LoadedPhoto,
-    view: View,
-    own: tuple[np.ndarray, np.ndarray],
-    others: Sequence[tuple[View, np.ndarray]],
+    photo: LoadedPhoto, view: View, own: tuple[np.ndarray, np.ndarray], others: Sequence[tuple[View, np.ndarray]]
 ) -> DenseDepth:
     """Return the pixels of a photo whose depth the inverse depths of a neighbour confirm."""
     rows, columns = np.nonzero(np.isfinite(own[0]))

@@ -154,12 +154,7 @@ def frames_folder(scene_dir: Path) -> Path:
 
 
 def extract_frames(
-    path: Path,
-    folder: Path,
-    *,
-    count: int | None,
-    overwrite: bool,
-    reporter: Reporter = Reporter(),
+    path: Path, folder: Path, *, count: int | None, overwrite: bool, reporter: Reporter = Reporter()
 ) -> None:
     """Write the sharpest frames of a video to `folder`, or keep them if they are there already.
 

@@ -67,10 +67,7 @@ class StabilisedModel:
 
 
 def choose_principal_points(
-    model: pycolmap.Reconstruction,
-    solver: Solver = Solver(),
-    *,
-    report: Report = lambda stage, done, total: None,
+    model: pycolmap.Reconstruction, solver: Solver = Solver(), *, report: Report = lambda stage, done, total: None
 ) -> StabilisedModel:
     """Return the model with a camera for each photo if their principal points differ, else the model as it is.
 
