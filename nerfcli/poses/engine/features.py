@@ -120,9 +120,8 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
     planned = matching_seconds(len(pairs), max_features=job.max_features) / job.threads
     most, start = limit_seconds(planned), time.perf_counter()
     options = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = job.seed
-    verification.ransac.max_num_trials = _MOST_TRIALS
+    ransac = {"random_seed": job.seed, "max_num_trials": _MOST_TRIALS}
+    verification = pycolmap.TwoViewGeometryOptions(ransac=ransac)
     pair_list = Path(job.folder) / "pairs.txt"
     # Matches are written after each block, so that progress is visible and kept.
     pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list, block_size=_PAIRS_PER_CALL // 8)
@@ -156,11 +155,10 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
 
 def _extract(job: Job, numbers: Iterable[int], search: _Search, *, watched: Sequence[int], report: Report) -> None:
     """Extract features of photos that have none, and report how many of the photos `watched` have some."""
+    sift = {"first_octave": search.first_octave, "peak_threshold": search.contrast}
     options = pycolmap.FeatureExtractionOptions(
-        max_image_size=job.max_image_size, num_threads=job.threads, use_gpu=False
+        max_image_size=job.max_image_size, num_threads=job.threads, use_gpu=False, sift=sift
     )
-    options.sift.first_octave = search.first_octave
-    options.sift.peak_threshold = search.contrast
     reader = pycolmap.ImageReaderOptions(mask_path=job.mask_folder if job.masks else "")
     with pycolmap.Database.open(job.database) as database:
         pending = {job.image_ids[number] for number in watched}

@@ -204,10 +204,8 @@ def _fisheye_focal_px(group: CameraGroup, job: Job, database: pycolmap.Database)
     pairs = _strongest_pairs({job.image_ids[number] for number in group.photos}, database)
     if not pairs:
         return None
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = job.seed
-    options.ransac.max_error = MOST_ERROR_PX
-    options.ransac.max_num_trials = 1000
+    ransac = {"random_seed": job.seed, "max_error": MOST_ERROR_PX, "max_num_trials": 1000}
+    options = pycolmap.TwoViewGeometryOptions(ransac=ransac)
     usual_px = usual_focal_px(group.width, group.height)
     camera = pycolmap.Camera.create_from_model_name(1, START_MODEL, usual_px, group.width, group.height)
     any_geometry = partial(pycolmap.estimate_two_view_geometry, options=options)

@@ -144,15 +144,12 @@ def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.Increm
     if attempt == 0 or len(job.files) >= _MANY_PHOTOS:
         options.ba_local_max_refinements, options.ba_local_max_num_iterations = 1, 10
         options.mapper.ba_global_ignore_redundant_points3D = True
+    thresholds = asdict(start)
+    init_pair = thresholds.pop("init_pair")
+    options.mapper.mergedict(thresholds | {"abs_pose_min_num_inliers": FEW_MATCHES, "constant_cameras": fixed})
     options.mapper.random_seed = options.triangulation.random_seed = seed
-    options.mapper.constant_cameras = fixed
-    options.mapper.init_min_tri_angle = start.init_min_tri_angle
-    options.mapper.init_min_num_inliers = start.init_min_num_inliers
-    options.mapper.init_max_forward_motion = start.init_max_forward_motion
-    options.mapper.filter_min_tri_angle = start.filter_min_tri_angle
-    options.mapper.abs_pose_min_num_inliers = FEW_MATCHES
-    if start.init_pair:
-        options.init_image_id1, options.init_image_id2 = start.init_pair
+    if init_pair:
+        options.init_image_id1, options.init_image_id2 = init_pair
         options.init_num_trials = 1  # every trial would begin with this pair
     return options
 

@@ -102,10 +102,8 @@ def _place(
         return NO_LENS if training else NO_TRAINING_PHOTO
     camera = camera_of_lens(model, placed)
     pixels, points = _seen_points(model, job, number, pairs)
-    options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.max_error = MAPPER.abs_pose_max_error
-    options.ransac.min_inlier_ratio = MAPPER.abs_pose_min_inlier_ratio
-    options.ransac.random_seed = job.seed
+    mapper = {"max_error": MAPPER.abs_pose_max_error, "min_inlier_ratio": MAPPER.abs_pose_min_inlier_ratio}
+    options = pycolmap.AbsolutePoseEstimationOptions(ransac={**mapper, "random_seed": job.seed})
     refinement = pycolmap.AbsolutePoseRefinementOptions(refine_focal_length=False, refine_extra_params=False)
     found = None
     if len(points) >= FEW_MATCHES:

@@ -228,11 +228,9 @@ def _pose(
     """Return the pose that most of the features agree on, with these features."""
     if len(features) < _LEAST_VOTES:
         return None
-    options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.max_error = photo.tolerance_px
-    options.ransac.random_seed = seed
-    options.ransac.max_num_trials = 40_000
-    options.ransac.confidence = 0.9999
+    options = pycolmap.AbsolutePoseEstimationOptions(
+        ransac={"max_error": photo.tolerance_px, "random_seed": seed, "max_num_trials": 40_000, "confidence": 0.9999}
+    )
     found = pycolmap.estimate_and_refine_absolute_pose(
         photo.pixels[features], model_points.places[points], photo.camera, estimation_options=options
     )
