@@ -126,7 +126,6 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
     # Matches are written after each block, so that progress is visible and kept.
     pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list, block_size=_PAIRS_PER_CALL // 8)
     ids = job.image_ids
-    cut_short, is_late = None, False
     with pycolmap.Database.open(job.database) as database:
         pending = {(ids[i], ids[j]) for i, j in pairs}
 
@@ -136,7 +135,7 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
 
         with _watched("match", done, len(pairs), report):
             for first in range(0, len(pairs), _PAIRS_PER_CALL):
-                if is_late := time.perf_counter() - start > most:
+                if time.perf_counter() - start > most:
                     break
                 part = pairs[first : first + _PAIRS_PER_CALL]
                 pair_list.write_text("\n".join(f"{job.files[i]} {job.files[j]}" for i, j in part), encoding="utf-8")
@@ -147,10 +146,10 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
                     verification_options=verification,
                     device=pycolmap.Device.cpu,
                 )
-        if is_late:  # counted here, since the watching thread has ended
-            left = len(pairs) - done()
-            cut_short = f"matching: {left} of {len(pairs)} pairs are not matched after {duration(most)}"
-    return cut_short
+            else:
+                return None
+        left = len(pairs) - done()  # counted here, since the watching thread has ended
+        return f"matching: {left} of {len(pairs)} pairs are not matched after {duration(most)}"
 
 
 def _extract(job: Job, numbers: Iterable[int], search: _Search, *, watched: Sequence[int], report: Report) -> None:
