@@ -76,11 +76,13 @@ def is_held_out(name: str, capture: Path) -> bool:
 
 
 def fill_background(capture: Path) -> None:
-    """Put a bright sky behind the objects of all photos, which then have no alpha."""
+    """Put a bright sky behind the objects of all photos, above textured ground; they then have no alpha."""
     for photo in capture.glob("*/*.png"):
         rgba = read_image(photo).astype(np.float64)
         opacity = rgba[..., 3:] / 255
-        write_png(photo, (rgba[..., :3] * opacity + np.array([90, 160, 250]) * (1 - opacity)).astype(np.uint8))
+        behind = np.random.default_rng(0).uniform(0, 255, rgba[..., :3].shape)
+        behind[: len(behind) // 2] = (90, 160, 250)
+        write_png(photo, (rgba[..., :3] * opacity + behind * (1 - opacity)).astype(np.uint8))
 
 
 CASES = {

@@ -30,8 +30,7 @@ from nerfcli.splats import refine as refinement
 from nerfcli.splats.gaussians import Gaussians, gaussians_of, rows_of
 from nerfcli.splats.refine import Refinement, load_splat_state, refine, splat_photos
 from nerfcli.splats.render import SplatScene
-from nerfcli.training.loop import OCCLUDERS
-from nerfcli.training.runs.files import SPLATS
+from nerfcli.training.runs.files import OCCLUDERS, SPLATS
 from nerfcli.workflows.evaluate import evaluate_splats
 from nerfcli.workflows.render import render_splats as render_file
 from nerfcli.workflows.splats import SplatSettings

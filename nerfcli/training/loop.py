@@ -26,14 +26,11 @@ from nerfcli.training.checkpoints import (
 )
 from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.preparation import prepare
-from nerfcli.training.runs.files import FIELD, LOG, METRICS, STATE, LogEntry, append_log, cut_log
+from nerfcli.training.runs.files import FIELD, LOG, METRICS, OCCLUDERS, STATE, LogEntry, append_log, cut_log
 from nerfcli.training.runs.run import RunConfig, continued, write_config
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import WAYPOINTS, Budget
 from nerfcli.training.sentinel import FAILURES, Sentinel
-
-# Folder of a run, named like the component that leaves pixels out.
-OCCLUDERS = "occluders"
 
 
 def write_left_out(run: Path, inputs: TrainingInputs, *, notify: Callable[[str], None]) -> None:

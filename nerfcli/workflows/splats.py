@@ -35,8 +35,7 @@ from nerfcli.splats.refine import (
 )
 from nerfcli.splats.render import SplatScene, near_of
 from nerfcli.splats.start import count_for, gaussians_of_field
-from nerfcli.training.loop import OCCLUDERS
-from nerfcli.training.runs.files import SPLATS
+from nerfcli.training.runs.files import OCCLUDERS, SPLATS
 from nerfcli.training.runs.run import Run
 from nerfcli.version import __version__
 

@@ -26,9 +26,8 @@ from nerfcli.machine import Resources, is_one_of_several
 from nerfcli.notices import Reporter, silent
 from nerfcli.output import Output
 from nerfcli.training import loop
-from nerfcli.training.loop import OCCLUDERS
 from nerfcli.training.runs.components import choose
-from nerfcli.training.runs.files import CONFIG, LOCK, STATE
+from nerfcli.training.runs.files import CONFIG, LOCK, OCCLUDERS, STATE
 from nerfcli.training.runs.run import Run, continued, split_hash
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.training.schedule import WAYPOINTS, Schedule, StepPlan

@@ -19,6 +19,7 @@ METRICS = "metrics.json"
 DEPTH_ERRORS = "depth_errors.json"
 PHOTO_DEPTHS = "photo_depths.npz"
 REPORT = "report.html"
+OCCLUDERS = "occluders"  # a folder of masks
 LOCK = ".train.lock"
 
 
