@@ -5,6 +5,7 @@ fog in front of the cameras, and the object hides in that fog.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,13 +17,31 @@ MOST_DIFFERENCE, BORDER_PX = 16.0, 5
 # Part of the border that has this colour, in all photos together and in each of them: the object may reach the border.
 # On captures with a plain background it was 0.89 to 1.0, and 0.72 in one photo of them; on 14 others at most 0.71.
 LEAST_OF_ALL, LEAST_OF_ONE = 0.8, 0.6
+# Smallest part of the pixels, so that a frame around the photos is no background. It was 0.56 to 0.68.
+LEAST_PART = 0.1
 
 
-def plain_background(photos: Sequence[LoadedPhoto]) -> list[np.ndarray] | None:
-    """Return for each photo the mask (H, W) of its background; None unless all photos have a background of one colour.
+@dataclass(frozen=True)
+class PlainBackground:
+    """A background of one colour.
 
-    It is what has this colour and is connected to the photo's border. So parts of the object in this colour, and gaps
-    through which the background is seen, are not in the mask.
+    Args:
+        colour: (3,) levels.
+        masks: for each photo (H, W), what has this colour and is connected to the photo's border: no parts of the
+            object in this colour, nor gaps through which the background is seen.
+    """
+
+    colour: np.ndarray
+    masks: list[np.ndarray]
+
+    @property
+    def is_black(self) -> bool:
+        """Whether the colour differs from black as little as its pixels may differ from it."""
+        return bool(self.colour.max() <= MOST_DIFFERENCE)
+
+
+def plain_background(photos: Sequence[LoadedPhoto]) -> PlainBackground | None:
+    """Return the background that all photos have; None if there is none.
 
     None for photos with alpha or with masks, which say themselves what is background, and for panoramas.
     """
@@ -35,7 +54,9 @@ def plain_background(photos: Sequence[LoadedPhoto]) -> list[np.ndarray] | None:
     alike = [_difference(border, colour).mean(0) <= MOST_DIFFERENCE for border in borders]
     if np.concatenate(alike).mean() < LEAST_OF_ALL or min(part.mean() for part in alike) < LEAST_OF_ONE:
         return None
-    return [_connected(photo.pixels, colour) for photo in photos]
+    masks = [_connected(photo.pixels, colour) for photo in photos]
+    is_large = sum(int(mask.sum()) for mask in masks) >= LEAST_PART * sum(mask.size for mask in masks)
+    return PlainBackground(colour, masks) if is_large else None
 
 
 def _border(pixels: np.ndarray) -> np.ndarray:

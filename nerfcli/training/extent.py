@@ -118,11 +118,12 @@ def object_frame(scene: Capture) -> tuple[Similarity, Marching]:
 
 
 def fits_object_frame(scene: Capture) -> bool:
-    """Return whether nearly all 3D points are in the unit ball of `object_frame`; True if there are none."""
+    """Return whether the cameras look at one place from outside, and nearly all 3D points, if any, are around it."""
     centre, radius = _object_ball(scene)
-    return len(scene.points) == 0 or bool(
-        (np.linalg.norm(scene.points - centre, axis=1) <= radius).mean() >= OBJECT_PART
-    )
+    if radius < 1e-9:  # a camera that turned
+        return False
+    inside = np.linalg.norm(scene.points - centre, axis=1) <= radius
+    return len(inside) == 0 or bool(inside.mean() >= OBJECT_PART)
 
 
 def _object_ball(scene: Capture) -> tuple[np.ndarray, float]:

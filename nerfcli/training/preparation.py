@@ -24,8 +24,8 @@ from nerfcli.photos.exif import mean_log_exposure, relative_log_exposures
 from nerfcli.training.evidence import LEARN_FOCAL, Evidence, TrainingPhotos, collect_evidence, tracks_of_model
 from nerfcli.training.extent import Extent, choose_extent, fits_object_frame, lacks_depth
 from nerfcli.training.fitting import TrainingInputs
-from nerfcli.training.pool import Album, PixelPool, PointRays, load_album
-from nerfcli.training.runs.components import Components, Selection
+from nerfcli.training.pool import PixelPool, PointRays, load_album
+from nerfcli.training.runs.components import LEARNED_BACKGROUNDS, Components, Selection
 from nerfcli.training.runs.run import RunConfig
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.training.schedule import SEARCH_FRACTION, Budget
@@ -75,7 +75,8 @@ def prepare(
     notify(text)
     album = load_album(scene.train_frames, factor=factor, threads=threads, storage=storage, masks=masks)
     shared = SharedFeatures(album.photos, lambda: tracks_of_model(scene, album.photos), threads=threads)
-    photos = TrainingPhotos(scene, album, shared, _plain_background(scene, album, settings))
+    photos = TrainingPhotos(scene, album, shared)
+    photos = replace(photos, plain=_plain_background(photos, settings, None if begun is None else begun.extent))
 
     if begun is not None:
         settings = replace(settings, components=begun.config.components)
@@ -119,18 +120,31 @@ def _extent(photos: TrainingPhotos, settings: TrainSettings, *, notify: Callable
     """Return the extent of the field; without 3D points, from triangulated ones if it needs any."""
     scene, is_object = photos.scene, photos.show_object
     if lacks_depth(scene, settings, is_object=is_object):
-        frames = [photo.frame for photo in photos.album.photos]
-        scene = replace(scene, points=triangulate(frames, photos.shared.of_matches).found)
+        scene = _with_points(photos)
         notify(f"the scene has no 3D points; estimating its extent from {len(scene.points)} triangulated ones")
     return choose_extent(scene, settings, is_object=is_object)
 
 
-def _plain_background(scene: Capture, album: Album, settings: TrainSettings) -> list[np.ndarray] | None:
-    """Return the masks of a plain background around an object; None if there is none, or the background is set."""
+def _with_points(photos: TrainingPhotos) -> Capture:
+    """Return the scene with 3D points triangulated from matched features."""
+    frames = [photo.frame for photo in photos.album.photos]
+    return replace(photos.scene, points=triangulate(frames, photos.shared.of_matches).found)
+
+
+def _plain_background(photos: TrainingPhotos, settings: TrainSettings, begun: Extent | None) -> list[np.ndarray] | None:
+    """Return the masks of a plain background around an object; None if there is none that the model can show.
+
+    Args:
+        begun: extent of a training that is resumed.
+    """
+    found, kind = plain_background(photos.album.photos), settings.components.background
     is_open = settings.model == "auto" and "background" not in settings.fixed
-    if not (is_open or settings.components.background == "sphere") or not fits_object_frame(scene):
+    if found is None or not (is_open or kind in LEARNED_BACKGROUNDS or (kind != "random" and found.is_black)):
         return None
-    return plain_background(album.photos)
+    if begun is not None:
+        return found.masks if begun.contraction == "none" else None
+    scene = photos.scene if len(photos.scene.points) else _with_points(photos)
+    return found.masks if fits_object_frame(scene) else None
 
 
 def _decide(

@@ -42,7 +42,7 @@ class TrainSettings:
         steps: total number of optimiser steps, including those before a resume; None for no limit.
         downscale: photos are averaged over squares of this many pixels; None for automatic.
         contraction: mapping of space to the unit cube of the field, see `kernels.contraction`; None for automatic:
-            "none" for photos with alpha, which show only an object, "l2" for others.
+            "none" for photos of an object with alpha or before a plain background, "l2" for others.
         seed: seed of all random numbers.
         device: a torch device name.
         first_samples_per_step, samples_per_step: target number of field samples of a step, at the start and at most;
