@@ -296,6 +296,14 @@ def test_a_split_that_holds_out_no_placed_photo_leaves_an_earlier_scene(
     assert is_same_scene(again, photos, ONE_THREAD)
 
 
+@pytest.mark.usefixtures("same_process")
+def test_held_out_photos_may_be_listed_in_the_scene_that_is_replaced(photos: Path, again: Path):
+    listed = again / "sparse" / "0" / "test.txt"
+    listed.write_text(NAMES[0])
+    estimate(photos, again, replace(ONE_THREAD, holdout=str(listed)))
+    assert json.loads((again / "scene.json").read_text())["split"]["test"] == [NAMES[0]]
+
+
 def test_a_backup_of_a_database_is_not_removed_with_it(tmp_path: Path):
     kept = {"database.db.bak", "database.db-copy"}
     for name in (*kept, "database.db", "database.db-wal", "database.db-shm", "database.db-journal"):

@@ -94,10 +94,10 @@ def estimate_poses(
                 raise _refused(add_advice(error, report.moving_foreground), report, scene_dir)
             notify(f"accepted because of --accept-refused: {error.message}")
         try:
-            _split(report)  # before an earlier scene is replaced
+            split = _split(report)  # before an earlier scene, which may hold the list, is replaced
         except UserError as error:
             raise _reported(error, report, scene_dir) from error
-        publish(scene_dir, lambda: _describe_scene(report, scene_dir, photos_dir, given=given))
+        publish(scene_dir, lambda: _describe_scene(report, scene_dir, photos_dir, given=given, split=split))
     for note in closing_notes(report):
         notify(note)
     return report
@@ -197,7 +197,14 @@ def _lay_out(prepared: PreparedPhotos, work: Path, notify: Tell) -> Job:
     return move_held_out_last(job)
 
 
-def _describe_scene(report: PosesReport, scene_dir: Path, photos_dir: Path, *, given: Calibration | None) -> None:
+def _describe_scene(
+    report: PosesReport,
+    scene_dir: Path,
+    photos_dir: Path,
+    *,
+    given: Calibration | None,
+    split: dict[str, str | None],
+) -> None:
     """Write poses_report.json and scene.json."""
     write_json(scene_dir / "poses_report.json", asdict(report))
     provenance = {"command": "poses", "settings": asdict(report.settings), "versions": report.versions}
@@ -210,7 +217,7 @@ def _describe_scene(report: PosesReport, scene_dir: Path, photos_dir: Path, *, g
         unit="arbitrary",
         masks=_masks_of(report, scene_dir),
         depths=depths_beside(photos_dir),
-        split=_split(report),
+        split=split,
     )
 
 
