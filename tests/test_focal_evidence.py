@@ -165,6 +165,11 @@ def test_cameras_are_listed():
     assert notes([big, big, small]) == (
         "2 cameras, by EXIF and size: 2 photos of 4000x3000 (SIMPLE_RADIAL), 1 photo of 640x480 (SIMPLE_RADIAL)",
     )
+    zooms = [replace(CAMERA, focal_mm=float(20 * n)) for n in range(1, 8)]
+    (note,) = notes([*zooms, replace(zooms[0], lens="8mm Fisheye")])
+    assert note == (
+        "8 cameras, by EXIF and size: 1 photo of 5472x3648 (OPENCV_FISHEYE), 7 photos of 5472x3648 (SIMPLE_RADIAL)"
+    )
     (note,) = notes([replace(CAMERA, lens="8mm Fisheye"), *(sized(NO_EXIF, 600 + n, 480) for n in range(22))])
     assert note.startswith("23 cameras, by EXIF and size: 1 photo of 5472x3648 (OPENCV_FISHEYE), 1 photo of 600x480 (")
     assert note.endswith("1 photo of 604x480 (SIMPLE_RADIAL) and 17 more")

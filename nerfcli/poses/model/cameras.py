@@ -1,5 +1,6 @@
 """Groups of photos with a common camera, and initial intrinsics: from EXIF and size, or as given."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -62,8 +63,17 @@ def group_photos(photos: Photos, *, model: str) -> PhotoGroups:
     if len(groups) == 1:
         return PhotoGroups(tuple(groups), notes)
     by = "folder, EXIF and size" if any("/" in name for name in photos.names) else "EXIF and size"
-    each = listed([f"{several(len(g.photos), 'photo')} of {g.width}x{g.height} ({g.model})" for g in groups])
-    return PhotoGroups(tuple(groups), (f"{len(groups)} cameras, by {by}: {each}", *notes))
+    return PhotoGroups(tuple(groups), (f"{len(groups)} cameras, by {by}: {_each(groups)}", *notes))
+
+
+def _each(groups: Sequence[CameraGroup]) -> str:
+    """List the cameras, alike ones together, and those of rare models first: a long list is cut."""
+    alike: dict[tuple[str, int, int], list[int]] = {}
+    for group in groups:
+        alike.setdefault((group.model, group.width, group.height), []).append(len(group.photos))
+    models = Counter(group.model for group in groups)
+    by_rarity = sorted(alike.items(), key=lambda item: models[item[0][0]])
+    return listed([f"{several(sum(counts), 'photo')} of {w}x{h} ({model})" for (model, w, h), counts in by_rarity])
 
 
 def _panoramas(photos: tuple[int, ...], first: Photo) -> CameraGroup:
