@@ -3,12 +3,15 @@
 import signal
 import subprocess
 import sys
+import threading
 import time
 
+import pytest
 from commands import started
 from corner import write_capture
 
 from nerfcli.errors import INTERRUPTED, TERMINATED
+from nerfcli.poses.input.job import repeatedly
 from nerfcli.poses.workspace import workspace
 
 
@@ -92,6 +95,22 @@ cli.main()
         time.sleep(0.02)
     _, stderr = process.communicate(timeout=60)
     assert (process.returncode, stderr) == (INTERRUPTED, "Interrupted; completed work is kept.\n")
+
+
+def test_an_interrupt_while_a_watching_thread_starts_leaves_none_that_python_waits_for(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    start = threading.Thread.start
+
+    def interrupted(thread: threading.Thread) -> None:
+        start(thread)
+        raise KeyboardInterrupt
+
+    before = set(threading.enumerate())
+    monkeypatch.setattr(threading.Thread, "start", interrupted)
+    with pytest.raises(KeyboardInterrupt), repeatedly(lambda: None, seconds=0.01):
+        pass
+    assert set(threading.enumerate()) <= before
 
 
 def test_sigterm_ends_poses_and_its_worker_without_a_stack_trace(tmp_path):

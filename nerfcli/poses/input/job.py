@@ -222,10 +222,11 @@ def repeatedly(look: Callable[[], object], *, seconds: float = 1.0) -> Iterator[
         while not finished.wait(seconds):
             look()
 
-    watcher = threading.Thread(target=watch)
-    watcher.start()
+    watcher = threading.Thread(target=watch, daemon=True)
     try:
+        watcher.start()  # Ctrl-C may come while it starts
         yield
     finally:
         finished.set()
-        watcher.join()
+        if watcher.ident is not None:
+            watcher.join()
