@@ -163,8 +163,12 @@ def job_of_five() -> Job:
 
 
 def test_a_held_out_photo_is_not_said_to_lack_features_where_no_training_photo_is_placed():
-    whole = place_held_out(job := job_of_five(), training_part(job), {"models": []}, lambda *progress: None)
+    seen = {"features": 60, "best_matches": 8, "best_partner": "a"}
+    result = {"models": [], "evidence": dict.fromkeys("ade", seen)}
+    whole = place_held_out(job := job_of_five(), training_part(job), result, lambda *progress: None)
     assert whole["left_out"] == dict.fromkeys(("b", "c"), NO_MODEL)
+    unseen = {"features": 0, "best_matches": 0, "best_partner": None}
+    assert whole["evidence"] == dict.fromkeys("ade", seen) | dict.fromkeys("bc", unseen)
     assert dominant([NO_MODEL, "too few features (9 in 40x30 pixels)"])[0] == "too few features"
 
 
