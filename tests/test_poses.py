@@ -126,6 +126,7 @@ def test_the_report_file_has_the_promised_keys(solved: Solved):
     notes = {"name": "notes.jpg", "registered": False, "reason": solved.report.images[0].reason}
     assert report["images"][0] == notes | {"orientation": None, "pose_blur_px": None}
     assert [image["orientation"] for image in report["images"] if image["registered"]] == [1, 6, 1, 1, 6, 1, 1]
+    assert all(image["pose_blur_px"] > 0 for image in report["images"] if image["registered"])
     assert report["verdict"]["accepted"]
     assert report["parts"] == [7]
     assert report["models"][0] == report["registered"] == 7
