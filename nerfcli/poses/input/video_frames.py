@@ -166,6 +166,7 @@ def extract_frames(
         folder: gets frame_000123.jpg... and frames.json, all or nothing.
         count: how many; None for 120. A video with fewer frames gives all of them.
         overwrite: replace frames that were made from another video or with another count.
+        reporter: receives messages, and the fraction of the work that is done.
 
     Raises:
         UserError: the video cannot be read or is cut short, or shows fewer than four different pictures; or `folder`

@@ -41,7 +41,7 @@ class UndeterminedError(np.linalg.LinAlgError):
 
 @dataclass(frozen=True)
 class OwnCameras:
-    """Photos with cameras of their own, which differ in the principal point.
+    """The lens of each photo; photos may have cameras of their own, which differ in the principal point.
 
     lens_of: the lens of each photo, by image id. shifting: ids of the images whose principal points are free, as poses
     are.
@@ -138,7 +138,9 @@ def lens_evidence(
 
     Observations are weighted as the robust adjustment does, see `held_out.adjust`.
 
-    `camera_id` is that of the lens where photos have cameras of their own.
+    Args:
+        camera_id: that of the lens where photos have cameras of their own.
+        own: None if photos share cameras.
 
     Raises:
         UndeterminedError: there are fewer observations than unknowns.

@@ -142,6 +142,11 @@ def uncertainty(
 ) -> dict[str, Any]:
     """Compute the uncertainty of the intrinsics of a camera, one standard deviation each, for the report.
 
+    Args:
+        camera_id: that of the lens where photos have cameras of their own.
+        principal_point: whether it is free.
+        own: None if photos share cameras.
+
     Returns:
         {"focal_percent", "principal_point_px": its uncertainty if it were free, "principal_point_free",
         "distortion_border_px": uncertainty of distortion at the corner, None for a lens without distortion, "weak":
