@@ -76,6 +76,17 @@ def test_reading_in_a_convention_undoes_writing_in_it(axes, centre):
     np.testing.assert_allclose(again.observations.pixels, capture.observations.pixels, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("option", ["--axes", "--from-axes"])
+def test_empty_axes_are_refused(option, tmp_path):
+    """Regression: they counted as those of the format, as if the option were not given."""
+    source = model_of(tmp_path, capture_of([PINHOLE]))
+    result = nerfcli("convert", source, tmp_path / "out.json", "--to", "transforms", option, "")
+    assert result.exit_code == USAGE
+    assert "names no axes" in result.stderr
+    assert option in result.stderr
+    assert not (tmp_path / "out.json").exists()
+
+
 # Round trips
 
 EVERYTHING = [PINHOLE, BROWN, RATIONAL, FISHEYE, PRISM, PANORAMA]

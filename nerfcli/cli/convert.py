@@ -95,7 +95,7 @@ class SourceOptions:
         from nerfcli.captures.axes import Convention
 
         centre = _pixel_centre(self.from_pixel_center, "--from-pixel-center")
-        return Convention(self.from_axes or "", self.from_inverted, centre, self.from_size)
+        return Convention(_axes(self.from_axes, "--from-axes"), self.from_inverted, centre, self.from_size)
 
     def given(self) -> "UserInputs":
         """Return photos, masks and camera; reads the file of intrinsics."""
@@ -181,7 +181,8 @@ class FormatOptions:
             stated = "missing" if to is None else repr(to)
             raise typer.BadParameter(f"{stated}; choose one of {', '.join(FORMATS_WRITTEN)}", param_hint="--to")
         one_of(self.pixels, ("stored", "upright"), "--pixels")
-        convention = Convention(self.axes or "", pixel_centre=_pixel_centre(self.pixel_center, "--pixel-center"))
+        centre = _pixel_centre(self.pixel_center, "--pixel-center")
+        convention = Convention(_axes(self.axes, "--axes"), pixel_centre=centre)
         return TargetOptions(format_named(to), convention, self.allow_loss, self.overwrite, self.pixels)
 
 
@@ -314,6 +315,13 @@ def _verdict(question: "Question") -> str:
     if question.ratio == float("inf"):
         return "fits; the next puts most of the evidence behind the cameras"
     return f"fits, {question.ratio:.3g} times better than the next"
+
+
+def _axes(text: str | None, option: str) -> str:
+    """Return the axes that are given; "", which stands for those of the format, if the option is left out."""
+    if text == "":
+        raise typer.BadParameter("'' names no axes; leave the option out for those of the format", param_hint=option)
+    return text or ""
 
 
 def _pixel_centre(text: str | None, option: str) -> float:
