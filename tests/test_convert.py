@@ -87,6 +87,14 @@ def test_empty_axes_are_refused(option, tmp_path):
     assert not (tmp_path / "out.json").exists()
 
 
+@pytest.mark.parametrize("convention", [Convention(inverted=True), Convention(intrinsics_scale=2.0)])
+def test_poses_and_sizes_of_a_written_file_cannot_be_chosen(convention, tmp_path):
+    """Regression: they were ignored."""
+    with pytest.raises(ValueError, match="only axes and pixel centre of a written file can be chosen, got Convention"):
+        convert(capture_of([PINHOLE]), tmp_path / "a.json", TargetOptions(format_named("transforms"), convention))
+    assert not (tmp_path / "a.json").exists()
+
+
 # Round trips
 
 EVERYTHING = [PINHOLE, BROWN, RATIONAL, FISHEYE, PRISM, PANORAMA]

@@ -238,6 +238,8 @@ def _orientation_notes(turned: ReorientedCapture) -> tuple[str, ...]:
 def _convention(form: Format, wanted: TargetOptions) -> Convention:
     """Return the convention of the file to be written."""
     axes, pixel_centre = wanted.convention.axes or form.axes, wanted.convention.pixel_centre
+    if wanted.convention != Convention(wanted.convention.axes, pixel_centre=pixel_centre):
+        raise ValueError(f"only axes and pixel centre of a written file can be chosen, got {wanted.convention}")
     if not np.array_equal(opencv_from_axes(axes), opencv_from_axes(form.axes)) and not form.open_axes:
         raise UserError(
             f"{form.name} prescribes the camera axes {form.axes}, not {axes}",
