@@ -95,6 +95,14 @@ def test_poses_and_sizes_of_a_written_file_cannot_be_chosen(convention, tmp_path
     assert not (tmp_path / "a.json").exists()
 
 
+def test_an_unknown_format_is_reported_with_the_known_ones():
+    """Regression: a bare KeyError."""
+    with pytest.raises(UserError, match="unknown format 'nerfstudio'") as raised:
+        format_named("nerfstudio")
+    assert raised.value.exit_code == USAGE
+    assert all(form.name in raised.value.hint for form in FORMATS)
+
+
 # Round trips
 
 EVERYTHING = [PINHOLE, BROWN, RATIONAL, FISHEYE, PRISM, PANORAMA]

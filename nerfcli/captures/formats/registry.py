@@ -136,8 +136,15 @@ def photo_folder(path: Path) -> Path | None:
 
 
 def format_named(name: str) -> Format:
-    """Return the format with this name."""
-    return {form.name: form for form in FORMATS}[name]
+    """Return the format with this name.
+
+    Raises:
+        UserError: there is none.
+    """
+    named = {form.name: form for form in FORMATS}
+    if name not in named:
+        raise UserError(f"unknown format {name!r}", f"choose one of {', '.join(named)}", exit_code=2)
+    return named[name]
 
 
 def depths_beside(photos: Path) -> dict[str, SensorDepth]:
