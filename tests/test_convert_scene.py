@@ -229,7 +229,10 @@ def test_which_pixels_can_be_chosen(tmp_path):
 
 
 def test_markers_are_sought_in_photos_as_the_scene_shows_them(tmp_path):
-    """The shape of a camera does not reveal half a turn, and cameras of a scene must not be turned a second time."""
+    """The shape of a camera does not reveal half a turn, and cameras of a scene must not be turned a second time.
+
+    Here they are for photos of half the size.
+    """
     frames = photos_of(tmp_path, sheet_of_markers([3, 17], 120), per_unit=120 / 0.7)
     for frame in frames:
         assert frame.image is not None
@@ -237,6 +240,7 @@ def test_markers_are_sought_in_photos_as_the_scene_shows_them(tmp_path):
         exif = Image.Exif()
         exif[0x0112] = 3
         Image.fromarray(pixels[::-1, ::-1]).save(frame.image, exif=exif)
+    frames = [replace(frame, camera=frame.camera.resized(320, 240)) for frame in frames]
     capture = Capture(tuple(frames), np.zeros((0, 3)), (), None, "made", pixels="upright")
     write_scene(capture, tmp_path / "scene")
     options = ("--to", "nerfcli", "--markers", "DICT_4X4_50:0.05", "--json")

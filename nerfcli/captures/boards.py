@@ -303,6 +303,10 @@ def scale_from_markers(frames: Sequence[Frame], side: float, *, dictionary: str)
 def scale_from_charuco(frames: Sequence[Frame], board: CharucoBoard) -> ScaleEstimate:
     """Estimate metres per unit from all neighbouring inner corners of a ChArUco board; see `scale_from_corners`.
 
+    Args:
+        frames: with cameras that fit the photos on disk, see `orientation.upright`.
+        board: as it was printed.
+
     Raises:
         UserError: an unknown dictionary or one with too few markers, a photo that cannot be read, or no corners that
             two photos show.
@@ -344,4 +348,6 @@ def _photos(frames: Sequence[Frame]) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the index and grey picture (H, W) uint8 of each frame, whose camera is for the photo as it is on disk."""
     for index, frame in enumerate(frames):
         assert frame.image is not None
-        yield index, cv2.cvtColor(np.ascontiguousarray(read_image(frame.image)[..., :3]), cv2.COLOR_RGB2GRAY)
+        picture = read_image(frame.image)
+        assert picture.shape[1::-1] == frame.camera.size, "see orientation.upright"
+        yield index, cv2.cvtColor(np.ascontiguousarray(picture[..., :3]), cv2.COLOR_RGB2GRAY)
