@@ -1,8 +1,8 @@
 """Read numbers and texts from files that may be damaged.
 
 Whatever is missing, or not as a function expects it, is one `UserError` that names file and field. `where` is always
-the file and the place in it, such as "poses.txt: line 3", and begins the message; `expected` is the hint. If the value
-is what programs write where a number is not known, the error is a `NotFiniteError`.
+the file and the place in it, such as "poses.txt: line 3", and begins the message; `expected` is the hint, but for JSON
+that is cut off. If the value is what programs write where a number is not known, the error is a `NotFiniteError`.
 """
 
 import codecs

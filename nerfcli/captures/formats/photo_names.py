@@ -59,7 +59,7 @@ class FoundPhotos:
                 capture,
                 f"none of the {len(self.listed)} listed photos exists in {self.folder}, such as "
                 f"{shown(self.listed[0])}",
-                f"the photos are needed for their names and sizes; {GIVE_PHOTOS}",
+                f"the photos are needed, as the capture lacks some of their names or sizes; {GIVE_PHOTOS}",
             )
         return self
 
