@@ -17,12 +17,13 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.captures.formats.run_cameras import RunCameras
+from nerfcli.errors import UserError
 from nerfcli.evaluate.ledger import Entry
 from nerfcli.evaluate.metrics import Metrics
 from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.evaluate.protocol import Novelty, PhotoMetrics, RunMetrics
 from nerfcli.evaluate.report.page import from_above, page_html
-from nerfcli.evaluate.report.run_facts import RunFacts, captures_of, labels_of, mismatches_of, warnings_of
+from nerfcli.evaluate.report.run_facts import RunFacts, captures_of, labels_of, mismatches_of, read_facts, warnings_of
 from nerfcli.evaluate.report.views import (
     ERROR_RANGE,
     HeldOutRenderings,
@@ -39,7 +40,7 @@ from nerfcli.render.depth import DepthRequest
 from nerfcli.render.job import depth_meta
 from nerfcli.training.runs.components import Components, Decision, Selection
 from nerfcli.training.runs.files import LogEntry, TrainingSummary
-from nerfcli.training.runs.run import RunConfig
+from nerfcli.training.runs.run import Run, RunConfig, write_config
 from nerfcli.training.runs.settings import TrainSettings
 
 EVIL = "</script><script>alert(1)</script><b>\"'"
@@ -322,6 +323,18 @@ def test_everything_that_was_warned_about_is_listed():
         assert sum(part in text for text in reported) == 1, part
     assert len(reported) == 8
     assert list(warnings_of(facts())) == []
+
+
+def test_a_report_of_poses_that_cannot_be_reached_is_no_missing_one(tmp_path):
+    """Regression: warnings about the poses were silently left out."""
+    scene, run = tmp_path / "scene", tmp_path / "run"
+    for folder in (scene, run):
+        folder.mkdir()
+    write_config(run, RunConfig(scene=scene))
+    (run / "log.jsonl").touch()
+    (scene / "poses_report.json").symlink_to("poses_report.json")
+    with pytest.raises(UserError, match=r"cannot read .*poses_report\.json"):
+        read_facts(Run(run), "a run", checkpoint_sha256="1")
 
 
 def test_labels_are_the_shortest_ends_that_differ():

@@ -143,6 +143,10 @@ def _of_poses(poses: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 def _json(path: Path) -> dict[str, Any] | None:
     """Return the JSON object in a file; None if the file does not exist."""
-    if not os.path.exists(path):
+    try:
+        os.stat(path)
+    except (FileNotFoundError, NotADirectoryError):
         return None
+    except OSError:
+        pass  # `read_json` says why
     return read_json(path, needed=(), hint="write it again with the command that created it")
