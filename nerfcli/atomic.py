@@ -164,7 +164,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path, *, needed: tuple[str, ...], hint: str) -> dict[str, Any]:
-    """Read an object that `write_json` wrote.
+    """Read a JSON object from a file.
 
     Args:
         path: the file.
@@ -176,8 +176,10 @@ def read_json(path: Path, *, needed: tuple[str, ...], hint: str) -> dict[str, An
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UserError(f"cannot read {path}: {error}", hint) from error
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or error}", hint) from error
+    except ValueError as error:
+        raise UserError(f"cannot read {path}: it is not JSON: {error}", hint) from error
     if not isinstance(content, dict):
         raise UserError(f"cannot read {path}: it is not a JSON object", hint)
     if missing := [key for key in needed if key not in content]:

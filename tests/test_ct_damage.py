@@ -199,7 +199,10 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str, *tuple[str, ...]]] = {
     "stack of another size": (frame_of_another_size, "has 5 x 3 pixels, the first projection 10 x 6"),
     "coloured picture": (coloured, "projections are grey|has the shape"),
     "unknown key": (lambda f: stack(f, changed={"anlges": [1]}).path, "'anlges' is not a key"),
-    "no JSON": (lambda f: edited(stack(f).path / "scan.json", '"kind"', '"kind').parent, r"cannot read .*scan\.json"),
+    "no JSON": (
+        lambda f: edited(stack(f).path / "scan.json", '"kind"', '"kind').parent,
+        r"scan\.json: it is not JSON: ",
+    ),
     "no projections there": (lambda f: stack(f, changed={"projections": "p/*.tif"}).path, "no projections match"),
     "counts called transmissions": (lambda f: stack(f, changed={"kind": "transmission"}).path, "transmissions up to"),
     "counts called line integrals": (
