@@ -253,6 +253,11 @@ def test_damage_is_reported_in_two_lines_and_nothing_is_written(name: str, tmp_p
     assert not (tmp_path / "out").exists()
 
 
+def test_a_truth_of_null_is_none(tmp_path: Path) -> None:
+    """Regression: it was refused as missing, unlike null for any other key that may be left out."""
+    assert "truth" not in read_scan(stack(tmp_path, changed={"truth": None}).path).history
+
+
 def test_names_of_projections_are_no_patterns(tmp_path: Path) -> None:
     path = edited(nikon(tmp_path).path, "Name=bone", "Name=/data/bone")
     assert len(read_scan(path).values) == VIEWS

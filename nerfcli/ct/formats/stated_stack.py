@@ -162,7 +162,7 @@ def _held_out(fields: Statement, views: int) -> list[int] | None:
 
 def _truth(fields: Statement, factor: float) -> dict[str, Any]:
     """Describe the true volume, centred on the origin; its stated attenuation is in the inverse of the stated unit."""
-    if "truth" not in fields:
+    if fields.value("truth") is None:
         return {}
     stated = fields.nested("truth", hint="truth has volume, voxel_size and attenuation_per_value")
     path = fields.path.parent / stated.text("volume")
