@@ -12,7 +12,7 @@ import numpy as np
 from nerfcli.errors import UserError
 from nerfcli.matching.features import find_features
 from nerfcli.pages.page import jpeg_bytes
-from nerfcli.photos.colours import linear_light
+from nerfcli.photos.colours import linear_light, over_white
 from nerfcli.photos.exif import Exif, read_exif
 from nerfcli.photos.focal_evidence import with_digital_zoom
 from nerfcli.photos.images import downscale, read_image
@@ -234,9 +234,7 @@ def _opaque(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the picture (H, W, 3) on white, and a mask (H, W) of its opaque pixels."""
     if image.shape[2] == 3:
         return image, np.ones(image.shape[:2], dtype=bool)
-    alpha = image[..., 3:].astype(np.float32) / 255
-    on_white = np.rint(image[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
-    return on_white, image[..., 3] > 127
+    return over_white(image), image[..., 3] > 127
 
 
 def _features(rgb: np.ndarray, seen: np.ndarray, *, local_detail: np.ndarray, most_features: int) -> PhotoFeatures:

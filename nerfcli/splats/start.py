@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import torch
 
+from nerfcli.cameras.frame import chosen_evenly
 from nerfcli.field.background import Colour, SphereBackground, colours_behind
 from nerfcli.field.exposure import exposed, linear_from_srgb
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera
@@ -137,7 +138,7 @@ def field_maps(
     wanted = max(LEAST_REDUCTION, (sum(photo.pixels[..., 0].size for photo in photos) / allowed) ** 0.5)
     reduction = min(wanted, LARGEST_REDUCTION)
     number = max(1, round(len(photos) * (reduction / wanted) ** 2))
-    chosen = np.unique(np.linspace(0, len(photos) - 1, number).astype(int)).tolist()
+    chosen = chosen_evenly(range(len(photos)), number)
     maps = {}
     for index in chosen:
         frame = photos[index].frame
