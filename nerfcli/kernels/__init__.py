@@ -1,6 +1,6 @@
 """The hot operations of the program behind one interface: `reference` defines them, faster backends agree with it.
 
-A backend is chosen once per training or model, from the device and the precision of its field.
+A backend is chosen once per training or model, from the device, the precision and the size of its field.
 """
 
 import functools

@@ -35,9 +35,9 @@ from nerfcli.kernels.interface import (
 class Backend:
     """The hot operations: here those of `reference`, on any device and in any precision.
 
-    `name` is its name in `backend_for`; `deterministic` says whether the same inputs always give the same bits;
-    `operations` are the single operations on packed samples, as `reference` defines them. Subclasses differ in these,
-    and in how they sample and evaluate a hash grid.
+    `name` is its name in descriptions of the machine and in messages; `deterministic` says whether the same inputs
+    always give the same bits; `operations` are the single operations on packed samples, as `reference` defines them.
+    Subclasses differ in these, and in how they sample and evaluate a hash grid.
 
     Args:
         device: of its tensors; on a GPU, sums are added in varying order, and results do not repeat to the bit.

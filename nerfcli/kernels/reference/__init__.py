@@ -1,7 +1,7 @@
 """The definition of every hot operation, in plain torch: short, any dtype, any device, never optimised.
 
 Letters and packing as in `kernels.interface`. A fast kernel in another folder agrees with these functions in value and
-gradient. `backend` composes them.
+gradient. `kernels.composition` composes them.
 """
 
 from nerfcli.kernels.reference.compositing import (
