@@ -529,10 +529,14 @@ def test_what_repeats_bit_for_bit_says_so():
     assert not deterministic(kernels.backend_for(torch.device("cuda"), torch.float32))
 
 
+@pytest.mark.parametrize("size", [{"levels": 3}, {"width": 16}, {"width": 64}, {"levels": 16, "features": 2}])
+def test_a_field_of_a_size_without_compiled_kernels_takes_the_reference(size):
+    assert HashField(replace(COMPILED, **size)).backend.name == "reference"
+
+
 def test_a_field_takes_another_backend_where_it_goes():
     field = HashField(COMPILED)
     assert field.backend.name == "numba_cpu"
-    assert HashField(replace(COMPILED, levels=3)).backend.name == "reference"  # a size without compiled kernels
     assert field.backend is field.backend
     assert field.double().backend.name == "reference"
     assert field.float().backend.name == "numba_cpu"
