@@ -43,6 +43,7 @@ def refusal(*arguments: str | Path, exit_code: int = BAD_INPUT, stdin: str | Non
     """Return the error and the hint of a command that is refused, after checking its exit code."""
     result = nerfcli(*arguments, stdin=stdin)
     assert result.exit_code == exit_code, (arguments, result.stderr)
+    assert result.stdout == "", arguments
     return error_of(result)
 
 
