@@ -144,3 +144,13 @@ def test_the_field_ends_around_an_object_if_its_background_can_be_shown(tmp_path
     trained = nerfcli("train", tmp_path / "spheres", "-o", tmp_path / "run", "--steps", "1", *options)
     assert trained.exit_code == 0, trained.stderr
     assert (", bounded scene" if bounded else ", unbounded scene") in trained.stderr
+
+
+def test_a_resumed_training_knows_the_background_again(tmp_path):
+    put_on(tmp_path / "spheres", (255, 255, 255))
+    for steps in ("3", "6"):
+        trained = nerfcli("train", tmp_path / "spheres", "-o", tmp_path / "run", "--steps", steps, "--resume")
+        assert trained.exit_code == 0, trained.stderr
+    assert "resumed at step 3" in trained.stderr
+    assert ", bounded scene" in trained.stderr
+    assert read_log(tmp_path / "run")[-1]["losses"]["sky"] > 0.0

@@ -15,7 +15,7 @@ from nerfcli.photos.loading import LoadedPhoto
 # Levels within which a pixel has the colour of the background, and the width over which noise is averaged.
 MOST_DIFFERENCE, BORDER_PX = 16.0, 5
 # Part of the border that has this colour, in all photos together and in each of them: the object may reach the border.
-# On captures with a plain background it was 0.89 to 1.0, and 0.72 in one photo of them; on 14 others at most 0.71.
+# On captures with a plain background it was 0.88 to 1, and 0.72 in one photo of them; on 13 others at most 0.67.
 LEAST_OF_ALL, LEAST_OF_ONE = 0.8, 0.6
 # Smallest part of the pixels, so that a frame around the photos is no background. It was 0.56 to 0.68.
 LEAST_PART = 0.1
