@@ -24,6 +24,7 @@ import pycolmap
 import pytest
 from corner import NAMES, write_capture
 from in_this_process import worker_in_this_process
+from PIL import Image
 
 import nerfcli
 from nerfcli.errors import OUT_OF_MEMORY, UserError
@@ -32,7 +33,7 @@ from nerfcli.poses import structure_from_motion
 from nerfcli.poses import workspace as workspace_module
 from nerfcli.poses.engine.database import remove_database
 from nerfcli.poses.input.job import read_job, read_stage, write_stage
-from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.poses.input.settings import QUALITIES, PoseSettings
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.structure_from_motion import estimate_poses, plan_poses
 from nerfcli.poses.workspace import database_bytes, hash_inputs, is_same_scene, workspace
@@ -398,6 +399,16 @@ def test_planning_writes_nothing(photos: Path):
     assert (prepared.plan.photos, prepared.plan.rule, prepared.plan.pairs) == (8, "retrieval", 28)
     assert len(prepared.pairing.pairs) == 28
     assert sorted(path.name for path in photos.parent.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("photos", "quality", "features"), [(99, "default", 4096), (100, "default", 2048), (100, "best", 8192)]
+)
+def test_many_photos_need_fewer_features(tmp_path, photos, quality, features):
+    for number in range(photos):
+        Image.new("RGB", (8, 8), (number, 0, 0)).save(tmp_path / f"{number:03d}.png")
+    prepared = plan_poses(tmp_path, settings=replace(ONE_THREAD, max_features=QUALITIES[quality][1]))
+    assert (prepared.settings.max_features, prepared.plan.max_features) == (features, features)
 
 
 def _wait_for_worker(scene: Path) -> None:

@@ -25,7 +25,7 @@ from nerfcli.poses.input.layout import find_masks, lay_out_masks, lay_out_photos
 from nerfcli.poses.input.pairs import Pairing, choose_pairs, read_pairs
 from nerfcli.poses.input.photos import Photos, find_photos
 from nerfcli.poses.input.plan import Plan, make_plan
-from nerfcli.poses.input.settings import PoseSettings, check_settings, for_panoramas
+from nerfcli.poses.input.settings import PoseSettings, check_settings, for_many_photos, for_panoramas
 from nerfcli.poses.judge.checks import UNDERWAY
 from nerfcli.poses.model.cameras import PhotoGroups, group_by_given, group_photos
 from nerfcli.poses.report import PosesReport, closing_notes, make_report, refusal
@@ -151,6 +151,7 @@ def plan_poses(
         pairing = choose_pairs(photos.photos, rule=settings.pairing)
     else:
         pairing = read_pairs(Path(settings.pairs_file), photos)
+    settings = for_many_photos(settings, len(photos.photos))
     if any(group.is_panorama for group in grouped.groups):
         settings = for_panoramas(settings)
     return PreparedPhotos(photos, grouped, pairing, settings, make_plan(photos, pairing, settings))

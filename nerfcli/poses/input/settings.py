@@ -29,13 +29,17 @@ FULL_SIZE = 100_000
 # that are hard to match more often.
 QUALITIES = {"fast": (1000, 2048), "default": (1600, 4096), "best": (FULL_SIZE, 8192)}
 
+# From this many photos on, a photo has so many neighbours that fewer features place it as well, in two thirds of the
+# time or less: see "Hundreds of photos" in docs/research/poses.md.
+_MANY_PHOTOS, _FEATURES_OF_MANY = 100, QUALITIES["fast"][1]
+
 
 @dataclass(frozen=True)
 class PoseSettings:
     """Settings that the result depends on.
 
     max_image_size: longer side of the pictures that are searched for features, pixels. max_features: per photo. Both
-    are doubled for panoramas, see `for_panoramas`.
+    are doubled for panoramas, see `for_panoramas`, and the default is halved for many photos, see `for_many_photos`.
     threads: -1 for all; with 1 thread the same seed gives the same poses. camera_model: one of `CAMERA_MODELS`.
     min_registered: the fraction of photos that must be placed, 0...1. pairing: one of `PAIRINGS`; with pairs_file, a
     text file with two names per line, only these pairs are matched. masks: a folder of masks, see `photos.masks`.
@@ -68,6 +72,13 @@ class PoseSettings:
 def for_panoramas(settings: PoseSettings) -> PoseSettings:
     """Return the settings for panoramas, which show about six times as much as a photo, at a smaller scale."""
     return replace(settings, max_image_size=2 * settings.max_image_size, max_features=2 * settings.max_features)
+
+
+def for_many_photos(settings: PoseSettings, count: int) -> PoseSettings:
+    """Return the settings for this many photos: the default number of features is halved for 100 or more."""
+    if count < _MANY_PHOTOS or settings.max_features != QUALITIES["default"][1]:
+        return settings
+    return replace(settings, max_features=_FEATURES_OF_MANY)
 
 
 def check_settings(settings: PoseSettings) -> None:
