@@ -15,7 +15,7 @@ from nerfcli.cameras.rigid import look_at
 from nerfcli.evaluate import metrics
 from nerfcli.evaluate.ledger import leak_ledger, summary_line
 from nerfcli.evaluate.metrics import Metrics, colour_aligned
-from nerfcli.evaluate.protocol import PhotoMetrics, RunMetrics, novelty
+from nerfcli.evaluate.protocol import PhotoMetrics, RunMetrics, copy_warnings, novelty
 from nerfcli.evaluate.requirements import known_numbers, parse_requirements, unmet
 from nerfcli.training.runs.components import Components, Selection
 from nerfcli.training.runs.run import RunConfig
@@ -88,6 +88,15 @@ def test_distances_are_reported_in_scene_radii_whatever_the_unit():
         found = novelty(frames[:1], frames[1:])[0]
         assert found.distance_relative == pytest.approx(2 * math.sin(math.pi / 8), rel=1e-6)
         assert found.angle_deg == pytest.approx(45)
+
+
+def test_held_out_copies_of_training_photos_are_told():
+    training = [looking(f"{x}", float(x)) for x in range(4)]
+    near = [looking("a", 1.0), looking("b", 2.0 + 1e-4), looking("c", 2.5)]
+    (text,) = copy_warnings(novelty(near, training))
+    assert text.startswith("2 of 3 held-out views have the pose of a training photo")
+    turned = replace(near[1], world_from_cam=look_at(np.array([2.0, 0, -4]), np.array([2.1, 0, 9.0]), UP))
+    assert copy_warnings(novelty([near[0], turned], training)) == []  # half of the views, as of a camera at rest
 
 
 def test_one_training_view_has_no_spacing():

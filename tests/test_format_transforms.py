@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from captures import CAMERAS, assert_same, photograph, put_photos, reprojection_px, ring, with_photos
 
+from nerfcli.atomic import write_json
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.axes import pose_in_axes
@@ -130,6 +131,7 @@ def test_rounded_poses_become_exactly_rigid(tmp_path):
         ({"fl_x": -3}, "fl_x is -3.0"),
         ({"fl_x": None, "fl_y": None}, "neither fl_x nor camera_angle_x"),
         ({"fl_x": None, "camera_angle_x": 4.0}, "camera_angle_x is 4.0"),
+        ({"fl_x": None, "fl_y": None, "K": [[40, 0], [0, 40]]}, "K is a list of 2"),
         ({"w": 63.5}, "w and h are 63.5"),
         ({"w": 0}, "w and h are 0"),
         ({"h": float("nan")}, "h is nan"),
@@ -301,6 +303,33 @@ def test_blender_files_are_read_back(tmp_path):
     png.unlink()  # a missing picture's name gets the suffix of NeRF's loader
     put_photos(tmp_path, "my photos/ä 02.jpg", size=(640, 480))
     assert parse_blender(tmp_path).frames[0].name == "train/r 0.png"
+
+
+def test_a_view_in_several_blender_files_is_used_once(tmp_path):
+    capture = with_photos(pinhole_ring(), tmp_path)
+    write_blender(replace(capture, frames=tuple(replace(frame, split="train") for frame in capture.frames)), tmp_path)
+    content = json.loads((tmp_path / "transforms_train.json").read_text(encoding="utf-8"))
+    for split, numbers in (("train", (0, 1, 2)), ("val", (4, 5)), ("test", (2, 3, 4))):
+        records = [content["frames"][number] for number in numbers]
+        write_json(tmp_path / f"transforms_{split}.json", {**content, "frames": records})
+    put_photos(tmp_path, *(frame.name for frame in capture.frames), size=(640, 480))
+    parsed = parse_blender(tmp_path)
+    splits = [(int(frame.name[-6:-4]), frame.split) for frame in parsed.frames]
+    assert splits == [(0, "train"), (1, "train"), (2, "train"), (5, "val"), (3, "test"), (4, "test")]
+    assert parsed.notes == ("2 views in more than one of the files: used as of the first of train, test and val",)
+    write_json(tmp_path / "transforms_test.json", {**content, "frames": 2 * content["frames"][:1]})
+    with pytest.raises(UserError, match="is listed twice"):
+        parse_blender(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["K", "intrinsics", "intrinsic_matrix"])
+def test_a_matrix_of_intrinsics_is_read_like_its_numbers(tmp_path, key):
+    put_photos(tmp_path, "a.png", "b.png", size=(64, 48))
+    frames = [entry("a.png", **{key: [[50.0, 0, 30.5], [0, 55.0, 24.5], [0, 0, 1]]}), entry("b.png", fl_x=70.0)]
+    write_json(tmp_path / "transforms.json", {"fl_x": 90.0, "cx": 31.0, "frames": frames})
+    first, second = load_scene(tmp_path).frames
+    assert first.camera.params == (50.0, 55.0, 30.5, 24.5)  # those of the frame count, not those of the file
+    assert second.camera.params == (70.0, 70.0, 31.0, 24.0)
 
 
 def test_what_blender_cannot_hold_is_listed(tmp_path):

@@ -28,6 +28,8 @@ from nerfcli.training.runs.files import TrainingSummary
 MOST_SPACINGS = 2.0
 # ...or differs in direction by more than this fraction of the field of view, so that less than half of it overlaps.
 MOST_TURN = 0.5
+# Up to this many typical distances and degrees, two poses are those of the same photo.
+_SAME_SPACINGS, _SAME_DEG = 0.01, 0.05
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,11 @@ class Novelty:
     spacings: float | None
     angle_deg: float
     kind: str
+
+    @property
+    def is_training_view(self) -> bool:
+        """True if a training photo has the same pose."""
+        return self.spacings is not None and self.spacings <= _SAME_SPACINGS and self.angle_deg <= _SAME_DEG
 
 
 def novelty(held_out: Sequence[Frame], training: Sequence[Frame]) -> list[Novelty]:
@@ -297,7 +304,7 @@ def evaluate_model(
         Metrics.mean([image.metrics for image in images]),
         tuple(images),
         shape,
-        (*_warnings(shape, evidence), *outlier_warnings(images)),
+        (*_warnings(shape, evidence), *copy_warnings(views or ()), *outlier_warnings(images)),
     )
 
 
@@ -305,6 +312,17 @@ def _warnings(shape: GeometryEvidence | None, evidence: GeometryComparison | Non
     if evidence is not None and evidence.failure is not None:
         return [f"the comparison with a model without geometry failed: {evidence.failure}"]
     return [shape.in_words()] if shape is not None and not shape.shown else []
+
+
+def copy_warnings(views: Sequence[Novelty]) -> list[str]:
+    """Return a warning if most held-out views have the poses of training photos, as of test files that are copies."""
+    same = sum(view.is_training_view for view in views)
+    if same <= len(views) / 2:
+        return []
+    return [
+        f"{same} of {len(views)} held-out views have the pose of a training photo: the metrics show how well the field "
+        "remembers photos, not how good new views are. Hold out others: nerfcli train SCENE --holdout every:8"
+    ]
 
 
 # A photo is far below the others if it lacks this many standard deviations, estimated by the median absolute deviation,

@@ -287,8 +287,8 @@ def compared_in_words(model: Model, loaded: Sequence[LoadedPhoto], splats: RunSp
         f"{seconds:.0f} s"
     )
     if of_splats < of_field - BELOW_DB:
-        # On large captures the splats gain about 1 dB each time the seconds are doubled.
-        longer = seconds * 2.0 ** (of_field - of_splats)
+        # On large captures the splats gain about 1 dB each time the seconds are doubled. A larger gap has other causes.
+        longer = seconds * 2.0 ** min(of_field - of_splats, 3.0)
         words += f"; the splats are below the field: go on with --resume --budget {longer:.0f}s"
     return words
 

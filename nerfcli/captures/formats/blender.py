@@ -18,14 +18,14 @@ from nerfcli.captures.formats.fields import check_unique_names, read_json_object
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.transforms import SPLITS, listed_frames, records_of, relative_path
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, several
 
 
 def parse_blender(folder: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read all views of a Blender capture, from the file of every split that exists.
 
     An image that is not on disk gets the size of the other images in its file; if there are none, that of the given
-    camera or of the first image.
+    camera or of the first image. A view in several files belongs to the first of train, test and val.
     """
     frames, missing, notes = list[Frame](), list[str](), list[str]()
     for split in SPLITS:
@@ -35,12 +35,17 @@ def parse_blender(folder: Path, given: UserInputs = UserInputs()) -> Capture:
             content = read_json_object(path)
             records = records_of(path, content)
             listed, unknown, said = listed_frames(path, content, records, suffix=".png", images=given.images, size=size)
+            check_unique_names((frame.name for frame in listed), path)
             frames += [replace(frame, split=split) for frame in listed]
             missing += unknown
             notes += said
     if not frames:
         raise UserError(f"{_file(folder, 'train')}: No such file", "give a folder of transforms_{train,val,test}.json")
-    check_unique_names((frame.name for frame in frames), folder)
+    kept = {frame.name: frame for split in ("val", "test", "train") for frame in frames if frame.split == split}
+    if len(kept) < len(frames):
+        twice = several(len(frames) - len(kept), "view")
+        notes.append(f"{twice} in more than one of the files: used as of the first of train, test and val")
+    frames = [frame for frame in frames if kept[frame.name] is frame]
     return Capture(tuple(frames), missing=tuple(missing), kind="blender", notes=tuple(notes))
 
 

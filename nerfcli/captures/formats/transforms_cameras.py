@@ -9,13 +9,16 @@ from typing import Any
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.formats import fields, lenses
-from nerfcli.captures.formats.fields import malformed
+from nerfcli.captures.formats.fields import malformed, matrix
 from nerfcli.captures.formats.lenses import Fits, Terms
 from nerfcli.captures.formats.limits import checked_camera
 from nerfcli.captures.formats.unsupported import distortion, projection
 from nerfcli.errors import several
 
 _INTRINSICS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+# Keys of a 3x3 matrix of intrinsics, and the keys of the numbers in it.
+_MATRICES = ("K", "intrinsics", "intrinsic_matrix")
+_IN_MATRIX = {"fl_x": (0, 0), "fl_y": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 # Keys that give the same number; the first counts.
 _SAME = (("fl_x", "camera_angle_x"), ("fl_y", "camera_angle_y"))
 # A smaller focal length, as a fraction of the picture's side, is no length in pixels: the view would be 178 degrees.
@@ -54,6 +57,7 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
         fits: takes a note where the terms are fitted by others.
     """
     width, height = size
+    record = _without_matrix(record, where)
     model = record.get("camera_model")
     model = model.strip().upper() if isinstance(model, str) else model
     if model == "EQUIRECTANGULAR":
@@ -89,6 +93,15 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
     return checked_camera("PINHOLE", width, height, head, where=where)
 
 
+def _without_matrix(record: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return the keys of a frame without focal length, but with a matrix of intrinsics, with the matrix's numbers."""
+    key = next((key for key in _MATRICES if record.get(key)), None)
+    if key is None or any(record.get(focal) is not None for keys in _SAME for focal in keys):
+        return record
+    values = matrix(record, key, (3,), 3, where)
+    return record | {name: float(values[place]) for name, place in _IN_MATRIX.items()}
+
+
 def merged(content: dict[str, Any], record: dict[str, Any]) -> dict[str, Any]:
     """Return the keys of a frame over those of the whole file, whose focal lengths count only where it has none.
 
@@ -96,7 +109,7 @@ def merged(content: dict[str, Any], record: dict[str, Any]) -> dict[str, Any]:
     """
     own = {key: value for key, value in record.items() if value not in (None, "")}
     focal = {key for keys in _SAME for key in keys}
-    unused = focal if focal & own.keys() else set[str]()
+    unused = focal if (focal | set(_MATRICES)) & own.keys() else set[str]()
     return record | {key: value for key, value in content.items() if key not in unused} | own
 
 
