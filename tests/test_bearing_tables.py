@@ -102,11 +102,7 @@ def test_trials_need_a_list_of_pixels_and_occluders_another_one():
     chosen = TrainSettings(budget_seconds=None, steps=7)
     photos = [
         needs_of(ring(), 1, settings=settings).photos
-        for settings in (
-            chosen,
-            replace(chosen, model="auto", fixed=("occluders",)),
-            replace(chosen, model="auto"),
-        )
+        for settings in (chosen, replace(chosen, model="auto", fixed=("occluders",)), replace(chosen, model="auto"))
     ]
     pixels = sum(frame.camera.width * frame.camera.height for frame in ring())
     assert np.diff(photos).tolist() == [9 * pixels, 10 * pixels]

@@ -20,14 +20,7 @@ from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.captures.formats.run_cameras import RunCameras
 from nerfcli.notices import Reporter
 from nerfcli.ply import read_ply_header
-from nerfcli.render.coverage import (
-    DepthMap,
-    coverage_and_parallax,
-    depth_maps,
-    largest_angle_deg,
-    sees,
-    without_steep,
-)
+from nerfcli.render.coverage import DepthMap, coverage_and_parallax, depth_maps, largest_angle_deg, sees, without_steep
 from nerfcli.render.files.file_facts import depth_meta_of
 from nerfcli.training.runs.files import PHOTO_DEPTHS
 from nerfcli.training.runs.run import Run

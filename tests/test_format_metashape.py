@@ -104,10 +104,7 @@ def metashape_pixels(value: dict[str, float], kind: str, size: tuple[int, int], 
     )
     r = np.hypot(x, y)
     radial = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6 + k4 * r**8
-    x, y = (
-        x * radial + p1 * (r**2 + 2 * x**2) + 2 * p2 * x * y,
-        y * radial + p2 * (r**2 + 2 * y**2) + 2 * p1 * x * y,
-    )
+    x, y = (x * radial + p1 * (r**2 + 2 * x**2) + 2 * p2 * x * y, y * radial + p2 * (r**2 + 2 * y**2) + 2 * p1 * x * y)
     return np.stack([width * 0.5 + cx + x * value["f"] + x * b1, height * 0.5 + cy + y * value["f"]], axis=-1)
 
 

@@ -55,10 +55,7 @@ def opencv_pixels(lens: dict[str, float], size: tuple[int, int], points: np.ndar
     k1, k2, p1, p2, k3 = lens["k1"], lens["k2"], lens["t2"], lens["t1"], lens["k3"]
     r2 = x * x + y * y
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    x, y = (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
+    x, y = (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
     f = lens["f"] / 36
     u = x * f * scale + (lens["px"] * scale + width * 0.5)
     v = y * f * scale + (lens["py"] * scale + height * 0.5)

@@ -40,10 +40,7 @@ def written(capture: Capture, name: str, folder: Path) -> Path:
     return path
 
 
-NOT_IN_OPENSFM = {
-    "FULL_OPENCV": ("k4", "k5", "k6"),
-    "RAD_TAN_THIN_PRISM_FISHEYE": ("p0", "p1", "s0", "s1", "s2", "s3"),
-}
+NOT_IN_OPENSFM = {"FULL_OPENCV": ("k4", "k5", "k6"), "RAD_TAN_THIN_PRISM_FISHEYE": ("p0", "p1", "s0", "s1", "s2", "s3")}
 # Formats that do not hold every camera, and those that they hold.
 HELD = {
     "transforms": [camera for camera in CAMERAS.values() if not lost_to_transforms(camera)],

@@ -17,11 +17,7 @@ from nerfcli.captures.axes import pose_in_axes
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.blender import losses_blender, parse_blender, write_blender
 from nerfcli.captures.formats.format import UserInputs
-from nerfcli.captures.formats.transforms import (
-    losses_transforms,
-    parse_transforms,
-    write_transforms,
-)
+from nerfcli.captures.formats.transforms import losses_transforms, parse_transforms, write_transforms
 from nerfcli.captures.formats.transforms_cameras import lost_to_transforms
 from nerfcli.captures.loading import load_scene
 from nerfcli.errors import BAD_INPUT, UserError

@@ -97,9 +97,7 @@ cli.main()
     assert (process.returncode, stderr) == (INTERRUPTED, "Interrupted; completed work is kept.\n")
 
 
-def test_an_interrupt_while_a_watching_thread_starts_leaves_none_that_python_waits_for(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_an_interrupt_while_a_watching_thread_starts_leaves_none_that_python_waits_for(monkeypatch: pytest.MonkeyPatch):
     start = threading.Thread.start
 
     def interrupted(thread: threading.Thread) -> None:

@@ -274,10 +274,7 @@ def test_checks_that_end_the_process_or_never_end_are_left_out(
     stages: list[str] = []
     scene = shutil.copytree(mapped, tmp_path / "scene")
     report, notes = estimate(
-        photos,
-        scene,
-        progress=lambda stage, done, total: stages.append(f"{stage} {done}"),
-        memory_bytes=1_000_000_000,
+        photos, scene, progress=lambda stage, done, total: stages.append(f"{stage} {done}"), memory_bytes=1_000_000_000
     )
     assert report.registered == len(NAMES)
     assert set(report.not_computed) == {"pose uncertainty", "lens models", "points of single photos"}

@@ -29,15 +29,7 @@ from nerfcli.field.checkpoint import load_tensors
 from nerfcli.photos.loading import load_photos
 from nerfcli.training.extent import Extent
 from nerfcli.training.fitting import Fitting, TrainingInputs
-from nerfcli.training.optimiser import (
-    BETAS,
-    EPS,
-    NewtonSteps,
-    WhitenedAdam,
-    mean_similarity,
-    whitening,
-    without_mean,
-)
+from nerfcli.training.optimiser import BETAS, EPS, NewtonSteps, WhitenedAdam, mean_similarity, whitening, without_mean
 from nerfcli.training.pool import PixelPool
 from nerfcli.training.refinement import LENS_RATE, PoseRefinement, Refinement
 from nerfcli.training.runs.components import Components
@@ -451,9 +443,7 @@ def test_a_step_of_all_hands_each_part_what_it_needs(small, monkeypatch):
     monkeypatch.setattr(lenses, "step", lambda gradient, rate: given.update(lens_rate=rate))
     monkeypatch.setattr(refinement.poses, "gradients", lambda *rays, **slopes: slopes["by_origin"].repeat(1, 2))
     monkeypatch.setattr(
-        refinement.poses,
-        "step",
-        lambda slopes, losses, photos, plan, *, rate: given.update(slopes=slopes, rate=rate),
+        refinement.poses, "step", lambda slopes, losses, photos, plan, *, rate: given.update(slopes=slopes, rate=rate)
     )
     numbers = torch.arange(50)
     drawn = refinement.refine_cameras(pool.rays_of(numbers))

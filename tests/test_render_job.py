@@ -318,7 +318,7 @@ def test_replacing_needs_overwrite_and_adding_does_not(model, tmp_path):
     before = contents(folder)
     render(model, job_of(), folder, overwrite=False)  # a video is added
     assert {name for name in contents(folder) if before.get(name) != contents(folder)[name]} == {
-        *("rgb.gif", "depth.gif", "render.json"),
+        *("rgb.gif", "depth.gif", "render.json")
     }
     before = contents(folder)
     render(model, job_of(), folder, overwrite=False, on_frames=stop_after(-1, AssertionError("a picture was rendered")))

@@ -14,13 +14,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.rigid import from_parts, rotation_from_vector
 from nerfcli.kernels.interface import BEYOND, LARGEST_ALPHA, LOW_PASS, Splats, SplatView
 from nerfcli.kernels.numba_cpu.splat_projection import project_point
-from nerfcli.kernels.numba_cpu.splats import (
-    SplatAdam,
-    SplatPicture,
-    render_splats,
-    splat_depths,
-    step_splats,
-)
+from nerfcli.kernels.numba_cpu.splats import SplatAdam, SplatPicture, render_splats, splat_depths, step_splats
 from nerfcli.kernels.reference.splats import composite_splats, project_splats
 from nerfcli.splats.render import lens_table
 

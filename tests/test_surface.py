@@ -17,14 +17,7 @@ from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_vector
 from nerfcli.errors import UserError
 from nerfcli.export import extent
-from nerfcli.export.depth_views import (
-    DepthView,
-    depth_views,
-    normals_of,
-    plane_rays,
-    point_colours,
-    surface_colours,
-)
+from nerfcli.export.depth_views import DepthView, depth_views, normals_of, plane_rays, point_colours, surface_colours
 from nerfcli.export.extent import Grid, SurfaceSettings, scene_box
 from nerfcli.export.fusion import FusedVolume, agreed_points, fuse
 from nerfcli.export.mesh_facts import read_glb_json

@@ -551,8 +551,7 @@ def says_the_same(text: str, other: str) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("file", "read"),
-    [("config.json", read_config), ("cameras.json", read_cameras), ("cameras.json", as_convert_reads)],
+    ("file", "read"), [("config.json", read_config), ("cameras.json", read_cameras), ("cameras.json", as_convert_reads)]
 )
 def test_a_digit_that_changes_in_the_description_of_a_run_is_noticed(file, read, views, tmp_path):
     fit(views, tmp_path / "run", replace(FEW, steps=1))

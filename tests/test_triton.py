@@ -127,14 +127,7 @@ def test_kernels_agree_with_the_reference_on_a_gpu():
     plain = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
     plain["NERFCLI_KERNELS"] = "triton_cuda"
     for _ in range(2):
-        done = subprocess.run(
-            SUITE,
-            env=plain,
-            capture_output=True,
-            text=True,
-            check=False,
-            cwd=HERE.parent,
-        )
+        done = subprocess.run(SUITE, env=plain, capture_output=True, text=True, check=False, cwd=HERE.parent)
         assert done.returncode == 0, done.stdout + done.stderr
 
 

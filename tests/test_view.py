@@ -264,12 +264,7 @@ def test_what_is_no_view_is_refused(damage, finished):
 def test_a_wrong_token_is_refused_everywhere(served):
     for token in ("", "x", served.server.token[:-1], served.server.token + "x"):
         wrong = served.url.replace(served.server.token, token)
-        for place, body in (
-            ("", None),
-            ("version", None),
-            ("field", None),
-            ("picture", {}),
-        ):
+        for place, body in (("", None), ("version", None), ("field", None), ("picture", {})):
             code, text = served.refusal(place, body, url=wrong)
             assert code == 403
             assert "wrong token" in text
@@ -361,8 +356,7 @@ def test_a_port_that_is_not_permitted_is_reported_as_such(finished, monkeypatch)
 
 
 @pytest.mark.parametrize(
-    ("host", "reached"),
-    [("0.0.0.0", "127.0.0.1"), ("localhost", "localhost"), ("::1", "[::1]"), ("::", "[::1]")],
+    ("host", "reached"), [("0.0.0.0", "127.0.0.1"), ("localhost", "localhost"), ("::1", "[::1]"), ("::", "[::1]")]
 )
 def test_the_ssh_command_leads_to_the_printed_address_without_a_user_name_too(finished, monkeypatch, host, reached):
     """As in a container whose user has no entry in /etc/passwd."""

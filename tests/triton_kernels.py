@@ -265,12 +265,7 @@ def test_visits_leave_out_densities_that_are_not_a_number(generator):
     grid = HashGrid(table, (4, 5, 6, 7, 8, 9, 10, 11), on_device(*layers_of(32, generator)))
     cell_depths = torch.full((8, 8, 8), -1.0, device=DEVICE)
     seen = marching.visible_samples(
-        rays,
-        march,
-        grid,
-        table=table.half().to(DEVICE),
-        capacity=marching.Capacity(),
-        cell_depths=cell_depths,
+        rays, march, grid, table=table.half().to(DEVICE), capacity=marching.Capacity(), cell_depths=cell_depths
     )
     assert seen.density.isnan().any()
     assert not cell_depths.isnan().any()
