@@ -14,9 +14,11 @@ from nerfcli.render.model import Model, load_model, save_model
 from nerfcli.render.pictures import render_picture
 from nerfcli.render.tracing import PictureRays, pixel_rays, render_rays
 from nerfcli.render.trained_field import Marching
-from nerfcli.training.fine_cells import SIDE, with_fine_cells
+from nerfcli.training import fine_cells
 
 BLACK = (0.0, 0.0, 0.0)
+# Cells along an edge of the cube. All 256 of a training take a minute; `spheres_run` has those.
+SIDE = 64
 
 
 @pytest.mark.parametrize("share", [0.0, 1e-3, 0.02, 1.0])
@@ -49,7 +51,7 @@ def ball() -> Model:
         field.table[0, : VERTICES**3, 0] = torch.where(inside, 1.0, -1.0).view(-1)
         field.weights[0][0, 0], field.weights[0][1, 0] = 1.0, -1.0
         field.weights[1][0, 0], field.weights[1][0, 1] = 6.0, -12.0
-    occupied = torch.ones(64, 64, 64, dtype=torch.bool)
+    occupied = torch.ones(32, 32, 32, dtype=torch.bool)
     return Model(field, occupied, Marching(0.5, 3.0, 1 / 192, 0.0), BLACK, Similarity(1.0, np.eye(3), np.zeros(3)), "m")
 
 
@@ -63,8 +65,11 @@ def looking_at_it(angle: float, size: int) -> Frame:
 @pytest.fixture(scope="module")
 def models() -> tuple[Model, Model, list[Frame]]:
     """The ball without and with fine cells, found by views from one half of the circle, and new views from there."""
-    frames = [looking_at_it(angle, 150) for angle in np.linspace(0, np.pi, 7)]
-    return ball(), with_fine_cells(ball(), frames), [looking_at_it(angle, 60) for angle in (0.3, 1.5, 2.9)]
+    frames = [looking_at_it(angle, 60) for angle in np.linspace(0, np.pi, 7)]
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(fine_cells, "SIDE", SIDE)
+        fine = fine_cells.with_fine_cells(ball(), frames)
+    return ball(), fine, [looking_at_it(angle, 60) for angle in (0.3, 1.5, 2.9)]
 
 
 def samples_of(model: Model, rays: PictureRays) -> tuple[int, torch.Tensor]:
