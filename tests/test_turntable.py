@@ -1,7 +1,7 @@
 """An object turning before a still background: recognised, masked, solved; and captures not to be mistaken for it."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -275,14 +275,34 @@ def made(capture: Turntable, tmp_path_factory: pytest.TempPathFactory) -> tuple[
     return folder, *solved(folder / "images", folder / "scene")
 
 
+@pytest.fixture(scope="module")
+def once() -> dict[str, Callable[..., list]]:
+    """The slow steps of making masks, which compute at their first call: the photos of `job` are always the same."""
+    found: dict[str, list] = {}
+
+    def remembering(name: str, step: Callable[..., list]) -> Callable[..., list]:
+        def recall(*given: Any, **more: Any) -> list:
+            if name not in found:
+                found[name] = step(*given, **more)
+            return list(found[name])
+
+        return recall
+
+    return {name: remembering(name, getattr(module, name)) for name in ("_compare_photos", "_make_masks")}
+
+
 @pytest.fixture
-def job(capture: Turntable, tmp_path: Path) -> Job:
+def job(
+    capture: Turntable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, once: dict[str, Callable[..., list]]
+) -> Job:
     """Return the worker's job for a turntable whose masks have been made."""
+    for name, step in once.items():
+        monkeypatch.setattr(module, name, step)
     work = tmp_path / "scene" / "work"
     (work / "photos").mkdir(parents=True)
     names = tuple(f"{number}.png" for number in range(len(capture.photos)))
     for name, photo in zip(names, capture.photos, strict=True):
-        Image.fromarray(photo).save(work / "photos" / name)
+        Image.fromarray(photo).save(work / "photos" / name, compress_level=1)
     made = Job(
         folder=str(work),
         files=names,
