@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from commands import completed, error_of, listing, nerfcli, refusal
 
-from nerfcli.errors import BAD_INPUT, OUT_OF_MEMORY
+from nerfcli.errors import BAD_INPUT
 
 PHANTOM = Path(__file__).parent.parent / "sample_scenes" / "phantom"
 
@@ -137,15 +137,6 @@ def test_a_folder_that_cannot_be_written_is_found_before_the_work(command, finis
     assert hint.startswith("Hint:  make ")
     assert hint.endswith(" writable, or use a folder that is")
     assert listing(tmp_path) == before
-
-
-def test_a_refused_training_leaves_the_run_that_it_would_replace(capture, finished):
-    """Regression: its metrics were gone, although its field was still there."""
-    (finished / "metrics.json").write_text("{}")
-    before = listing(finished)
-    result = nerfcli("train", capture, "--steps", "1", "--memory", "1MB", "--overwrite")
-    assert result.exit_code == OUT_OF_MEMORY
-    assert listing(finished) == {**before, ".train.lock": b""}
 
 
 def test_resuming_what_has_used_its_budget_changes_nothing(capture, tmp_path):

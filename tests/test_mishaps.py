@@ -130,6 +130,7 @@ def test_a_second_training_of_a_run_is_refused_while_the_first_is_at_work(captur
 
 def test_a_refused_training_leaves_no_trace(capture, finished):
     """For lack of memory: no new folder, no lock in one that was there, and nothing is missing from a run."""
+    (finished / "metrics.json").write_text("{}")
     there, new, run = capture.with_name("there"), capture.with_name("new"), listing(finished)
     there.mkdir()
     for folder in (there, new, finished):
