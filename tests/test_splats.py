@@ -210,7 +210,7 @@ def test_a_refused_path_does_not_end_a_batch(run: Path, tmp_path: Path) -> None:
 
 def test_resume_goes_on_and_other_settings_begin_again(run: Path) -> None:
     before = load_splat_state(run / SPLATS)
-    longer = replace(SMALL, budget_seconds=2.0, resume=True)
+    longer = replace(SMALL, budget_seconds=1.5, resume=True)
     again = Output(overwrite=True)
     nerfcli.export_run(run, again, to="splats", splats=longer)
     after = load_splat_state(run / SPLATS)
@@ -218,7 +218,7 @@ def test_resume_goes_on_and_other_settings_begin_again(run: Path) -> None:
     assert len(after.refinement.rows) == len(before.refinement.rows)
     with pytest.raises(UserError, match="are missing, or were made from another field"):
         nerfcli.export_run(run, again, to="splats", splats=replace(longer, degree=2))
-    nerfcli.export_run(run, again, to="splats", splats=replace(SMALL, degree=0))
+    nerfcli.export_run(run, again, to="splats", splats=replace(SMALL, degree=0, budget_seconds=0.2))
     assert load_splat_state(run / SPLATS).degree == 0
 
 
