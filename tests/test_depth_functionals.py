@@ -92,18 +92,17 @@ def test_mean_fraction_gradcheck_on_both_sides_of_the_series():
     assert torch.autograd.gradcheck(depth.mean_fraction, x)
 
 
-@pytest.mark.parametrize("name", ["opacity", "transmittance", "mean", "spread", "peak", "peak_weight", "quantiles"])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 30.0])
-def test_gradcheck(name, scale):
+def test_gradcheck(scale):
     density, starts, ends, _ = ray(7, count=6, scale=scale)
     offsets = torch.tensor([0, 0, 2, 6])
     arguments = tuple(x.clone().requires_grad_() for x in (density, starts, ends))
 
     def function(*values):
-        result = getattr(depth.ray_termination(*values, offsets=offsets, fractions=(0.001, 0.4)), name)
-        return result[~result.isnan()]
+        results = depth.ray_termination(*values, offsets=offsets, fractions=(0.001, 0.4))
+        return tuple(result[~result.isnan()] for result in results)
 
-    assert len(function(*arguments)) >= 2
+    assert min(map(len, function(*arguments))) >= 2
     assert torch.autograd.gradcheck(function, arguments, atol=1e-7)
 
 
