@@ -17,6 +17,7 @@ from scan_files import (
     COLUMNS,
     ROWS,
     VIEWS,
+    Written,
     data_exchange,
     heltomo,
     nikon,
@@ -106,91 +107,72 @@ def other_mat(folder: Path) -> Path:
     return folder / "b.mat"
 
 
+Make = Callable[[Path], Path]
+
+
+def exchange(name: str, value: object, *, units: str | None = None) -> Make:
+    """Return what writes a DataExchange file with another dataset."""
+    return lambda folder: rewritten(data_exchange(folder).path, f"exchange/{name}", value, units=units)
+
+
+def detector(name: str, value: object, *, units: str | None = None) -> Make:
+    """Return what writes an NXtomo file with another dataset of its detector."""
+    return lambda folder: rewritten(nxtomo(folder).path, f"entry/instrument/detector/{name}", value, units=units)
+
+
+def log(write: Callable[[Path], Written], old: str, new: str) -> Make:
+    """Return what writes a scan whose log has other words."""
+    return lambda folder: edited(write(folder).path, old, new)
+
+
+def stack_with(**changed: object) -> Make:
+    return lambda folder: stack(folder, changed=changed).path
+
+
+def swapped(folder: Path) -> Path:
+    path = exchange("data_white", np.full((3, ROWS, COLUMNS), 100.0))(folder)
+    return rewritten(path, "exchange/data_dark", np.full((3, ROWS, COLUMNS), 1100.0))
+
+
+ANGLES_WITH_NAN = np.where(ANGLES_DEG > 200, np.nan, ANGLES_DEG)
+ALL = (VIEWS, ROWS, COLUMNS)
+
 # For each case: the function that makes the input in a folder, the expected error, and options.
-REFUSED: dict[str, tuple[Callable[[Path], Path], str, *tuple[str, ...]]] = {
+REFUSED: dict[str, tuple[Make, str, *tuple[str, ...]]] = {
     # HDF5.
-    "zero flats": (
-        lambda f: rewritten(data_exchange(f).path, "exchange/data_white", np.zeros((3, ROWS, COLUMNS))),
-        "no pixel sees the beam",
-    ),
-    "flats and darks swapped": (
-        lambda f: rewritten(
-            rewritten(data_exchange(f).path, "exchange/data_white", np.full((3, ROWS, COLUMNS), 100.0)),
-            "exchange/data_dark",
-            np.full((3, ROWS, COLUMNS), 1100.0),
-        ),
-        "median of -1000 above the darks",
-    ),
-    "no flats": (lambda f: rewritten(data_exchange(f).path, "exchange/data_white", None), "has no flats"),
-    "flats of another size": (
-        lambda f: rewritten(data_exchange(f).path, "exchange/data_white", np.ones((3, 4, 4))),
-        "flats of 4 x 4 pixels",
-    ),
-    "missing angles": (
-        lambda f: rewritten(data_exchange(f).path, "exchange/theta", ANGLES_DEG[:-2]),
-        "7 angles for 9 projections",
-    ),
-    "no angles": (lambda f: rewritten(data_exchange(f).path, "exchange/theta", None), "has no exchange/theta"),
-    "angle of NaN": (
-        lambda f: rewritten(data_exchange(f).path, "exchange/theta", np.where(ANGLES_DEG > 200, np.nan, ANGLES_DEG)),
-        "angle 7 is nan",
-    ),
-    "one angle for all": (
-        lambda f: rewritten(data_exchange(f).path, "exchange/theta", np.full(VIEWS, 30.0)),
-        "all 9 angles are 30",
-    ),
-    "angles in an unknown unit": (
-        lambda f: rewritten(data_exchange(f).path, "exchange/theta", ANGLES_DEG, units="gon"),
-        "'gon' is not a unit of angle",
-    ),
-    "degrees called radians": (
-        lambda f: rewritten(data_exchange(f).path, "exchange/theta", ANGLES_DEG, units="radians"),
-        "angles span 240 radians",
-    ),
-    "wrong unit of a pixel": (
-        lambda f: rewritten(nxtomo(f).path, "entry/instrument/detector/x_pixel_size", 75.0, units="m"),
-        "a pixel of 75000 mm",
-    ),
-    "all values NaN": (
-        lambda f: rewritten(data_exchange(f).path, "exchange/data", np.full((VIEWS, ROWS, COLUMNS), np.nan)),
-        "only 0 % of the values are finite",
-    ),
-    "all values the same": (
-        lambda f: rewritten(data_exchange(f).path, "exchange/data", np.full((VIEWS, ROWS, COLUMNS), 7.0)),
-        "all values are 7",
-    ),
-    "text instead of frames": (lambda f: rewritten(data_exchange(f).path, "exchange/data", "lost"), "exchange/data"),
+    "zero flats": (exchange("data_white", np.zeros((3, ROWS, COLUMNS))), "no pixel sees the beam"),
+    "flats and darks swapped": (swapped, "median of -1000 above the darks"),
+    "no flats": (exchange("data_white", None), "has no flats"),
+    "flats of another size": (exchange("data_white", np.ones((3, 4, 4))), "flats of 4 x 4 pixels"),
+    "missing angles": (exchange("theta", ANGLES_DEG[:-2]), "7 angles for 9 projections"),
+    "no angles": (exchange("theta", None), "has no exchange/theta"),
+    "angle of NaN": (exchange("theta", ANGLES_WITH_NAN), "angle 7 is nan"),
+    "one angle for all": (exchange("theta", np.full(VIEWS, 30.0)), "all 9 angles are 30"),
+    "angles in an unknown unit": (exchange("theta", ANGLES_DEG, units="gon"), "'gon' is not a unit of angle"),
+    "degrees called radians": (exchange("theta", ANGLES_DEG, units="radians"), "angles span 240 radians"),
+    "wrong unit of a pixel": (detector("x_pixel_size", 75.0, units="m"), "a pixel of 75000 mm"),
+    "all values NaN": (exchange("data", np.full(ALL, np.nan)), "only 0 % of the values are finite"),
+    "all values the same": (exchange("data", np.full(ALL, 7.0)), "all values are 7"),
+    "text instead of frames": (exchange("data", "lost"), "exchange/data"),
     "HDF5 cut off": (lambda f: cut(data_exchange(f).path, 0.4), "cannot be read as HDF5"),
-    "keys without frames": (
-        lambda f: rewritten(nxtomo(f).path, "entry/instrument/detector/image_key", [1, 2, 0]),
-        "3 image keys for 13 frames",
-    ),
-    "no projections": (
-        lambda f: rewritten(nxtomo(f).path, "entry/instrument/detector/image_key", [1] * 13),
-        "no frame has image_key 0",
-    ),
+    "keys without frames": (detector("image_key", [1, 2, 0]), "3 image keys for 13 frames"),
+    "no projections": (detector("image_key", [1] * 13), "no frame has image_key 0"),
     # Scanners.
     "projection missing": (lambda f: without(nikon(f).path.parent, "bone_0004.tif"), "after number 3 the numbering"),
     "last projection missing": (lambda f: without(nikon(f).path.parent, "bone_0009.tif"), "holds 8 projections"),
-    "no distance": (lambda f: edited(nikon(f).path, "SrcToObject=100", ""), "has no SrcToObject"),
-    "negative distance": (
-        lambda f: edited(nikon(f).path, "SrcToDetector=400", "SrcToDetector=-400"),
-        "SrcToDetector is -400",
-    ),
-    "words for a number": (lambda f: edited(nikon(f).path, "WhiteLevel=60000", "WhiteLevel=high"), "is 'high'"),
-    "no step of angles": (lambda f: edited(nikon(f).path, "AngularStep=30", ""), "has no AngularStep"),
+    "no distance": (log(nikon, "SrcToObject=100", ""), "has no SrcToObject"),
+    "negative distance": (log(nikon, "SrcToDetector=400", "SrcToDetector=-400"), "SrcToDetector is -400"),
+    "words for a number": (log(nikon, "WhiteLevel=60000", "WhiteLevel=high"), "is 'high'"),
+    "no step of angles": (log(nikon, "AngularStep=30", ""), "has no AngularStep"),
     "angles for some views": (ang_file, "lists 3 angles for 9 projections"),
     "several scans in a folder": (several_scans, "holds several scans"),
     "picture cut off": (
         lambda f: cut(nikon(f).path.parent / "bone_0003.tif", 0.5).parent,
         "bone_0003.tif cannot be read",
     ),
-    "no flat field": (
-        lambda f: edited(skyscan(f).path, "Depth", "Flat Field Correction=OFF\nDepth"),
-        "the open beam is unknown",
-    ),
+    "no flat field": (log(skyscan, "Depth", "Flat Field Correction=OFF\nDepth"), "the open beam is unknown"),
     "log of another size": (
-        lambda f: edited(skyscan(f).path, "Number Of Columns=10", "Number Of Columns=20"),
+        log(skyscan, "Number Of Columns=10", "Number Of Columns=20"),
         "Number Of Columns is 20, the projections have 10",
     ),
     "other .mat file": (other_mat, "holds reconstruction, and no sinogram"),
@@ -198,25 +180,19 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str, *tuple[str, ...]]] = {
     # Folders with JSON.
     "stack of another size": (frame_of_another_size, "has 5 x 3 pixels, the first projection 10 x 6"),
     "coloured picture": (coloured, "projections are grey|has the shape"),
-    "unknown key": (lambda f: stack(f, changed={"anlges": [1]}).path, "'anlges' is not a key"),
+    "unknown key": (stack_with(anlges=[1]), "'anlges' is not a key"),
     "no JSON": (
         lambda f: edited(stack(f).path / "scan.json", '"kind"', '"kind').parent,
         r"scan\.json: it is not JSON: ",
     ),
-    "no projections there": (lambda f: stack(f, changed={"projections": "p/*.tif"}).path, "no projections match"),
-    "counts called transmissions": (lambda f: stack(f, changed={"kind": "transmission"}).path, "transmissions up to"),
-    "counts called line integrals": (
-        lambda f: stack(f, changed={"kind": "line_integral"}).path,
-        "line integrals up to",
-    ),
-    "held out beyond the end": (lambda f: stack(f, changed={"held_out": [40]}).path, "held_out is"),
-    "truth that is not there": (
-        lambda f: stack(f, changed={"truth": {"volume": "v.npy"}}).path,
-        "v.npy cannot be read",
-    ),
-    "truth without a size": (lambda f: stack(f, changed={"truth": 1}).path, "truth is 1"),
-    "unit of no length": (lambda f: stack(f, changed={"unit": "kg"}).path, "'kg' is not a unit of length"),
-    "vectors of another shape": (lambda f: stack(f, changed={"vectors": [[1, 2]] * VIEWS}).path, "vectors"),
+    "no projections there": (stack_with(projections="p/*.tif"), "no projections match"),
+    "counts called transmissions": (stack_with(kind="transmission"), "transmissions up to"),
+    "counts called line integrals": (stack_with(kind="line_integral"), "line integrals up to"),
+    "held out beyond the end": (stack_with(held_out=[40]), "held_out is"),
+    "truth that is not there": (stack_with(truth={"volume": "v.npy"}), "v.npy cannot be read"),
+    "truth without a size": (stack_with(truth=1), "truth is 1"),
+    "unit of no length": (stack_with(unit="kg"), "'kg' is not a unit of length"),
+    "vectors of another shape": (stack_with(vectors=[[1, 2]] * VIEWS), "vectors"),
     "npy missing": (lambda f: without(r2_gaussian(f).path, "proj_train/0002.npy"), "0002.npy does not exist"),
     "npy cut off": (
         lambda f: cut(r2_gaussian(f).path / "proj_train/0002.npy", 0.3).parents[1],
@@ -229,15 +205,14 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str, *tuple[str, ...]]] = {
     ),
     # Options.
     "photons of line integrals": (lambda f: heltomo(f).path, "does not apply to line integrals", "--photons", "1e4"),
-    "no photons": (lambda f: stack(f).path, "--photons -5", "--photons", "-5"),
-    "unit that is none": (lambda f: stack(f).path, "--unit parsec is not a unit", "--unit", "parsec"),
+    "no photons": (stack_with(), "--photons -5", "--photons", "-5"),
+    "unit that is none": (stack_with(), "--unit parsec is not a unit", "--unit", "parsec"),
     "a unit and no size": (
-        lambda f: rewritten(nxtomo(f).path, "entry/instrument/detector/x_pixel_size", None),
+        detector("x_pixel_size", None),
         "states no pixel size, to which --unit um would apply",
-        "--unit",
-        "um",
+        *("--unit", "um"),
     ),
-    "axis far outside": (lambda f: stack(f).path, "far outside the 10 columns", "--centre-of-rotation", "900"),
+    "axis far outside": (stack_with(), "far outside the 10 columns", "--centre-of-rotation", "900"),
 }
 
 
