@@ -195,19 +195,6 @@ class TestRealityScanXmp:
         assert caught.value.exit_code == BAD_INPUT
 
 
-def test_a_frame_whose_tracking_was_lost_is_left_out_and_named(tmp_path):
-    three = Views(CAMERA, np.concatenate([POSES, POSES[:1]]))
-    WITH_PHOTOS["3d-scanner-app"](three, tmp_path / "app")
-    WITH_PHOTOS["realityscan-xmp"](three, tmp_path / "xmp")
-    pose = json.loads((tmp_path / "app/frame_00001.json").read_text())["cameraPoseARFrame"]
-    change_json(tmp_path / "app/frame_00001.json", cameraPoseARFrame=[math.nan, *pose[1:]])
-    text(tmp_path / "xmp/1.xmp", re.sub("Position>[^<]*<", "Position>nan 0 0<", (tmp_path / "xmp/1.xmp").read_text()))
-    for place, name in (("app", "frame_00001.jpg"), ("xmp", "1.jpg")):
-        capture = parse(tmp_path / place)
-        assert len(capture.frames) == 2
-        assert capture.notes[0].startswith(f"1 of 3 frames left out: {name} (")
-
-
 class TestOpenMvg:
     def test_points_and_where_they_were_seen(self, tmp_path):
         path = WITH_PHOTOS["openmvg"](VIEWS, tmp_path)

@@ -303,7 +303,7 @@ LOST = 2
 # Formats whose files hold matrices, and are written number by number.
 OF_MATRICES = (
     *("metashape", "bundler", "polycam", "mvsnet", "pose-files", "alicevision", "openmvg", "nerfies"),
-    "3d-scanner-app",
+    *("3d-scanner-app", "realityscan-xmp"),
 )
 
 
