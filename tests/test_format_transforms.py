@@ -16,7 +16,6 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.captures.axes import pose_in_axes
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.blender import losses_blender, parse_blender, write_blender
-from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.transforms import losses_transforms, parse_transforms, write_transforms
 from nerfcli.captures.formats.transforms_cameras import lost_to_transforms
 from nerfcli.captures.loading import load_scene
@@ -263,18 +262,6 @@ def test_training_gets_the_points_beside_the_file(tmp_path):
     photograph(capture.frames)
     write_transforms(capture, tmp_path / "transforms.json")
     np.testing.assert_array_equal(load_scene(tmp_path).points, capture.points)
-
-
-def test_images_of_blender_files_in_another_folder(tmp_path):
-    capture = with_photos(pinhole_ring(), tmp_path / "images")
-    named = (replace(f, name=f"r_{i}.png", image=tmp_path / f"train/r_{i}.png") for i, f in enumerate(capture.frames))
-    write_blender(replace(capture, frames=tuple(named)), tmp_path)
-    with pytest.raises(UserError, match="does not exist"):
-        parse_blender(tmp_path)
-    put_photos(tmp_path / "elsewhere", *(f"r_{index}.png" for index in range(len(capture.frames))))
-    parsed = parse_blender(tmp_path, UserInputs(tmp_path / "elsewhere"))
-    assert [f.image for f in parsed.frames] == [tmp_path / "elsewhere" / f"r_{i}.png" for i in range(6)]
-    assert parsed.frames[0].camera.width == 64
 
 
 def test_blender_files_are_read_back(tmp_path):
