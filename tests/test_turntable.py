@@ -479,7 +479,7 @@ class TestPoses:
 
         The photos are in a subfolder, and so are their masks.
         """
-        capture = turntable(16, size=(480, 360), heights=2, turn_deg=90, shift_px=10, supersampled=1, seed=2)
+        capture = turntable(12, size=(480, 360), heights=2, turn_deg=90, shift_px=10, supersampled=1, seed=2)
         write(capture, tmp_path)
         (tmp_path / "images").rename(tmp_path / "one camera")
         (tmp_path / "photos").mkdir()
