@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -51,6 +52,7 @@ from nerfcli.training.runs.files import append_log, read_log
 from nerfcli.training.runs.run import load_run
 from nerfcli.workflows import pipeline
 from nerfcli.workflows.splats import file_digest
+from nerfcli.workflows.views import Views
 
 BATCH_COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench", "export")
 COMMANDS = (*BATCH_COMMANDS, "view")
@@ -841,6 +843,7 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
 
     monkeypatch.setattr(structure_from_motion, "estimate_poses", known_poses)
     monkeypatch.setattr(settings, "FEWEST_LOG2_ROWS", 10)
+    monkeypatch.setattr(pipeline, "Views", partial(Views, count=6))  # instead of 60 on the orbit
     arguments = ["run", capture / "train", "-o", tmp_path / "all", "--budget", "0.2s", "--downscale", "4"]
 
     def interrupted(*args: Any, on_progress: Callable[[Progress], None], **more: Any) -> None:
@@ -873,7 +876,7 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
     assert first.stdout.splitlines() == [str(path) for path in expected]
     assert all(path.exists() for path in expected)
     (film,) = re.findall(r"`nerfcli render \S+ --splats \S+\.ply ([^`]*)`", GUIDES[0].read_text(encoding="utf-8"))
-    film = film.replace("photos/", f"{tmp_path}/").split()
+    film = film.replace("photos/", f"{tmp_path}/").replace("--count 240", "--count 6").split()
     assert nerfcli("render", run, "--splats", tmp_path / "all" / "run-splats.ply", *film).exit_code == 0
     before = listing(run)
     again = nerfcli(*arguments)
