@@ -38,6 +38,10 @@ _LEAST_APART = 0.05
 # how busy the machine is nor on how much of the first mapping an earlier call has done.
 _LEAST_SECONDS = 60.0
 _GLOBALLY = "all photos at once (global mapper)"
+_MAY_LOOK_ALIKE = (
+    "photos of sides that look alike, as of a package, may still be joined wrongly: look at the result from all sides; "
+    "--masks can hide what repeats"
+)
 _Pairs = Set[frozenset[int]]  # of image ids
 
 
@@ -123,6 +127,8 @@ def remap_refused(given: ChosenModel, report: Report, tell: Tell) -> ChosenModel
         if found is None:
             continue
         if found.examined.verdict.accepted:
+            if what == ways[-1][0]:  # nothing that was mapped again agrees with it
+                tell(_MAY_LOOK_ALIKE)
             return found
         by_global_mapper = found.mapped.models if what == _GLOBALLY else by_global_mapper
         given = replace(given, mapped=replace(mapped, attempts=found.mapped.attempts))
