@@ -1,15 +1,22 @@
 """Pixels that look like a sky, in photos of a sky by direction above textured hills and of a plain wall."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
+import torch
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.matching import sky
-from nerfcli.matching.sky import PointsBefore, points_before, sky_masks
-from nerfcli.matching.tracks import Tracks
+from nerfcli.matching.sky import PointsBefore, points_before, points_of_depths, points_of_tracks, sky_masks
+from nerfcli.matching.stereo import DenseDepth
+from nerfcli.matching.tracks import MOST_POINTS, Tracks
 from nerfcli.photos.loading import LoadedPhoto
+from nerfcli.training.evidence import Evidence, confirm_sky, find_sky
 
 CAMERA = Camera.pinhole(160, 120, 140.0)
 GAINS = (1.0, 0.8, 1.2, 0.9, 1.0)
@@ -104,7 +111,7 @@ def before(points: np.ndarray, of: list[LoadedPhoto], *, seen_by: int) -> Points
     numbers, indices = np.tile(np.arange(len(points)), seen_by), np.repeat(np.arange(seen_by), len(points))
     rays = points[numbers] - np.array([one.frame.centre for one in of])[indices]
     tracks = Tracks(indices, numbers, rays / np.linalg.norm(rays, axis=1, keepdims=True))
-    return points_before(sky_masks(of, threads=1), of, tracks)
+    return points_before(sky_masks(of, threads=1), of, points_of_tracks(of, tracks))
 
 
 def points_in_front(count: int, *, above: bool) -> np.ndarray:
@@ -134,7 +141,44 @@ def test_few_points_and_points_of_two_photos_decide_nothing():
         found = before(points, photos(), seen_by=seen_by)
         assert not found.confirm
         assert not found.refute
-    assert points_before([np.zeros((120, 160), bool)] * 5, photos(), Tracks(*empty())) == PointsBefore(0, 0.0)
+    none = points_of_tracks(photos(), Tracks(*empty()))
+    assert points_before([np.zeros((120, 160), bool)] * 5, photos(), none) == PointsBefore(0, 0.0)
+
+
+def test_depths_by_stereo_confirm_a_sky_where_the_capture_has_no_points():
+    of = photos()
+    skies = sky_masks(of, threads=1)
+    shared = SimpleNamespace(of_model=Tracks(*empty()))
+    seen: Any = SimpleNamespace(album=SimpleNamespace(photos=of), shared=shared, plain=None)
+    rows, columns = np.divmod(np.arange(0, 120 * 160, 7), 160)
+    everywhere = np.stack([columns, rows], axis=-1)
+    below = everywhere[rows > 60]
+    for pixels, is_sky_confirmed in ((below, True), (everywhere, False), (below[:9], False)):
+        depth = DenseDepth(pixels, np.full(len(pixels), 3.0), np.zeros(len(pixels)))
+        found = Evidence(may_match=False)
+        find_sky(found, skies, seen, device=torch.device("cpu"))
+        assert found.sky is not None
+        assert found.sky.sum() == sum(mask.sum() for mask in skies)
+        assert not found.sky_confirmed
+        confirm_sky(found, skies, seen, [depth] * len(of))
+        assert found.sky_confirmed == is_sky_confirmed
+        assert found.sky is not None
+
+
+def test_pixels_of_known_depth_are_points_at_their_distances():
+    of = photos()[1:3]
+    pixels = np.array([[0, 0], [80, 60], [159, 119]])
+    dense = [DenseDepth(pixels, np.array([2.0, 3.0, 5.0]), np.zeros(3)) for _ in of]
+    points = points_of_depths(of, dense).reshape(2, 3, 3)
+    for one, found in zip(of, points, strict=True):
+        in_camera = (found - one.frame.centre) @ one.frame.world_from_cam[:3, :3]
+        np.testing.assert_allclose(np.linalg.norm(in_camera, axis=1), [2.0, 3.0, 5.0], rtol=1e-12)
+        np.testing.assert_allclose(CAMERA.project(in_camera)[0], pixels + 0.5, rtol=0, atol=1e-9)
+    vague = replace(dense[0], errors=np.array([0.0, 0.03, np.nan]))
+    assert len(points_of_depths(of, [vague, vague])) == 2
+    many = DenseDepth(np.zeros((MOST_POINTS, 2), np.int64), np.ones(MOST_POINTS), np.zeros(MOST_POINTS))
+    assert len(points_of_depths(of, [many, many])) == MOST_POINTS
+    assert len(points_of_depths(of, [replace(many, errors=many.errors + 1.0)] * 2)) == 0
 
 
 def empty() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

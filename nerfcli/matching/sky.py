@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 
 from nerfcli.matching.exposures import FEWEST_PIXELS
-from nerfcli.matching.tracks import MOST_POINTS, Tracks, triangulate
+from nerfcli.matching.stereo import DenseDepth
+from nerfcli.matching.tracks import MOST_POINTS, Tracks, triangulate, world_rays
 from nerfcli.photos.loading import LoadedPhoto
 
 # Size at which photos are compared, and number of other photos that each is compared with.
@@ -33,6 +34,8 @@ FEWEST_SIGHTINGS = 3
 # A sky has fewer points before it than this fraction of what it would have as a surface, and fewer than the second
 # number. With fewer points than the third number to expect, a wall might have none either.
 MOST_BEFORE, FEWEST_BEFORE, FEWEST_EXPECTED = 0.008, 3, 400.0
+# Depths by stereo with larger expected errors do not count: at the border of a sky they may be those of the ground.
+MOST_ERROR = 0.02
 # Poses are not exact: points within this fraction of the longer side of the region's border do not count.
 BORDER = 0.02
 
@@ -81,19 +84,36 @@ class PointsBefore:
         return not self.refute and self.expected >= FEWEST_EXPECTED
 
 
-def points_before(masks: Sequence[np.ndarray], photos: Sequence[LoadedPhoto], tracks: Tracks) -> PointsBefore:
-    """Count the points that photos have in common and that are in the sky of one of them.
+def points_of_tracks(photos: Sequence[LoadedPhoto], tracks: Tracks) -> np.ndarray:
+    """Return the points (N, 3) of tracks that at least `FEWEST_SIGHTINGS` photos see."""
+    surface = triangulate([photo.frame for photo in photos], tracks)
+    sightings = np.bincount(tracks.points[np.isfinite(surface.misses_px)], minlength=tracks.count)
+    return surface.points[sightings >= FEWEST_SIGHTINGS]
+
+
+def points_of_depths(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]) -> np.ndarray:
+    """Return points (N, 3) of pixels whose depths are known within `MOST_ERROR`, in equal steps over all of them."""
+    exact = [np.flatnonzero(depth.errors < MOST_ERROR) for depth in dense]
+    step = math.ceil(sum(map(len, exact)) / MOST_POINTS) or 1
+    points = [np.zeros((0, 3))]
+    for photo, depth, numbers in zip(photos, dense, exact, strict=True):
+        chosen = numbers[::step]
+        rays = world_rays(photo.frame.camera.bearings(depth.pixels[chosen] + 0.5), photo.frame.world_from_cam)
+        points.append(photo.frame.centre + rays * depth.distances[chosen, None])
+    found = np.concatenate(points)
+    return found[np.isfinite(found).all(axis=1)]
+
+
+def points_before(masks: Sequence[np.ndarray], photos: Sequence[LoadedPhoto], points: np.ndarray) -> PointsBefore:
+    """Count the points that are in the sky of a photo.
 
     A point hides the sky behind it. So a point that some photos see is outside the sky of all others, at any distance.
     A photo of a plain wall, however, has points of its neighbours behind the wall, and a few on it.
 
     Args:
         masks: (H, W) for each photo, see `sky_masks`.
-        tracks: of the points that these photos see; those that fewer than `FEWEST_SIGHTINGS` see do not count.
+        points: (N, 3) of surfaces, see `points_of_tracks` and `points_of_depths`.
     """
-    surface = triangulate([photo.frame for photo in photos], tracks)
-    sightings = np.bincount(tracks.points[np.isfinite(surface.misses_px)], minlength=tracks.count)
-    points = surface.points[sightings >= FEWEST_SIGHTINGS]
     points = points[:: math.ceil(len(points) / MOST_POINTS) or 1]
     found, expected = 0, 0.0
     for photo, mask in zip(photos, masks, strict=True):

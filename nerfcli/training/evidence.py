@@ -18,7 +18,7 @@ from nerfcli.matching.camera_check import CameraCheck, check_cameras
 from nerfcli.matching.correspondences import SharedFeatures
 from nerfcli.matching.exposures import matched_log_gains
 from nerfcli.matching.occluders import occluder_masks
-from nerfcli.matching.sky import points_before, sky_masks
+from nerfcli.matching.sky import points_before, points_of_depths, points_of_tracks, sky_masks
 from nerfcli.matching.stereo import LEAST_SIDE_PX, DenseDepth, affordable_side_px, dense_depths
 from nerfcli.matching.tracks import Tracks, indices_by_value, triangulate, world_rays
 from nerfcli.photos.exif import log_exposures
@@ -175,7 +175,7 @@ def collect_evidence(
     if wanted.background == "sphere" or (selects and "background" not in fixed and not pool.has_alpha):
         with found.timed("sky"):
             skies = photos.plain or sky_masks(album, threads=threads)
-            _find_sky(found, skies, photos, device=pool.colours.device)
+            find_sky(found, skies, photos, device=pool.colours.device)
 
     points_are_open = selects and may_use_points(wanted, fixed, has_alpha=pool.has_alpha, cameras=found.cameras)
     if wanted.points or (points_are_open and (shared.of_model.count or found.may_match)):
@@ -193,6 +193,7 @@ def collect_evidence(
     if with_exposures or with_occluders or with_depths:
         with found.timed("stereo"):
             dense = dense_depths(album, shared.tracks, longer_side_px=side_px or LEAST_SIDE_PX, threads=threads)
+            confirm_sky(found, skies, photos, dense)
     if with_depths:
         found.stereo_depths = dense_points(dense, pool)
         count = len(found.stereo_depths.numbers)
@@ -312,19 +313,30 @@ def _camera_check(photos: TrainingPhotos, notify: Callable[[str], None]) -> Came
         return None
 
 
-def _find_sky(found: Evidence, skies: list[np.ndarray], photos: TrainingPhotos, *, device: torch.device) -> None:
+def find_sky(found: Evidence, skies: list[np.ndarray], photos: TrainingPhotos, *, device: torch.device) -> None:
     """Fill in what masks (H, W) of pixels that look like a sky tell."""
     found.sky_fraction = _fraction(skies)
     if found.sky_fraction <= LEAST_SKY_FRACTION:
         return
     if photos.plain is None:
         # Tracks from matches would have two photos each.
-        before = points_before(skies, photos.album.photos, photos.shared.of_model)
+        points = points_of_tracks(photos.album.photos, photos.shared.of_model)
+        before = points_before(skies, photos.album.photos, points)
         if before.refute:
             found.sky_fraction = 0.0
             return
         found.sky_confirmed = before.confirm
     found.sky = torch.from_numpy(np.concatenate([mask.ravel() for mask in skies])).to(device)
+
+
+def confirm_sky(found: Evidence, skies: list[np.ndarray], photos: TrainingPhotos, dense: Sequence[DenseDepth]) -> None:
+    """Confirm a sky by depths from stereo matching if structure from motion has left no points that could.
+
+    They do not refute one: of poses that are a few pixels off, too many are in front of a sky.
+    """
+    if found.sky is not None and photos.plain is None and not photos.shared.of_model.count:
+        points = points_of_depths(photos.album.photos, dense)
+        found.sky_confirmed = points_before(skies, photos.album.photos, points).confirm
 
 
 def confirmed_by_exif(log_gains: np.ndarray, exif: np.ndarray) -> np.ndarray:
