@@ -126,7 +126,7 @@ def test_rounded_poses_become_exactly_rigid(tmp_path):
         ({"fl_x": -3}, "fl_x is -3.0"),
         ({"fl_x": None, "fl_y": None}, "neither fl_x nor camera_angle_x"),
         ({"fl_x": None, "camera_angle_x": 4.0}, "camera_angle_x is 4.0"),
-        ({"fl_x": None, "fl_y": None, "K": [[40, 0], [0, 40]]}, "K is a list of 2"),
+        ({"fl_x": None, "fl_y": None, "K": [[40, 0], [0, 40]]}, "neither fl_x nor camera_angle_x"),
         ({"w": 63.5}, "w and h are 63.5"),
         ({"w": 0}, "w and h are 0"),
         ({"h": float("nan")}, "h is nan"),
@@ -299,20 +299,43 @@ def test_a_view_in_several_blender_files_is_used_once(tmp_path):
     parsed = parse_blender(tmp_path)
     splits = [(int(frame.name[-6:-4]), frame.split) for frame in parsed.frames]
     assert splits == [(0, "train"), (1, "train"), (2, "train"), (5, "val"), (3, "test"), (4, "test")]
-    assert parsed.notes == ("2 views in more than one of the files: used as of the first of train, test and val",)
+    twice = ", ".join(capture.frames[number].name for number in (2, 4))
+    assert parsed.notes == (f"listed in several files: {twice}; used as of the first of train, test and val",)
+    other = {**content["frames"][0], "transform_matrix": content["frames"][1]["transform_matrix"]}
+    write_json(tmp_path / "transforms_test.json", {**content, "frames": [other]})
+    with pytest.raises(UserError, match="is listed twice, with different poses"):
+        parse_blender(tmp_path)
     write_json(tmp_path / "transforms_test.json", {**content, "frames": 2 * content["frames"][:1]})
     with pytest.raises(UserError, match="is listed twice"):
         parse_blender(tmp_path)
 
 
-@pytest.mark.parametrize("key", ["K", "intrinsics", "intrinsic_matrix"])
-def test_a_matrix_of_intrinsics_is_read_like_its_numbers(tmp_path, key):
-    put_photos(tmp_path, "a.png", "b.png", size=(64, 48))
-    frames = [entry("a.png", **{key: [[50.0, 0, 30.5], [0, 55.0, 24.5], [0, 0, 1]]}), entry("b.png", fl_x=70.0)]
+MATRIX = np.array([[50.0, 0, 30.5], [0, 55.0, 24.5], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("K", MATRIX.tolist()),
+        ("intrinsics", np.pad(MATRIX, (0, 1)).tolist()),
+        ("intrinsic_matrix", MATRIX.T.ravel().tolist()),  # as Open3D stores it
+    ],
+)
+def test_a_matrix_of_intrinsics_is_read_like_its_numbers(tmp_path, key, value):
+    put_photos(tmp_path, "a.png", "b.png", "c.png", size=(64, 48))
+    frames = [entry("a.png", **{key: value}), entry("b.png", fl_x=70.0), entry("c.png")]
     write_json(tmp_path / "transforms.json", {"fl_x": 90.0, "cx": 31.0, "frames": frames})
-    first, second = load_scene(tmp_path).frames
+    first, second, third = load_scene(tmp_path).frames
     assert first.camera.params == (50.0, 55.0, 30.5, 24.5)  # those of the frame count, not those of the file
     assert second.camera.params == (70.0, 70.0, 31.0, 24.0)
+    assert third.camera.params == (90.0, 90.0, 31.0, 24.0)
+
+
+@pytest.mark.parametrize("value", [[], 0, {"fx": 40}, [40, 40, 32, 24], 1, np.full((3, 3), 2.0).tolist(), "K.txt"])
+def test_what_is_no_matrix_of_intrinsics_changes_nothing(tmp_path, value):
+    put_photos(tmp_path, "a.png", size=(64, 48))
+    write_json(tmp_path / "transforms.json", {"fl_x": 90.0, "frames": [entry("a.png", intrinsics=value)]})
+    assert load_scene(tmp_path).frames[0].camera.params == (90.0, 90.0, 32.0, 24.0)
 
 
 def test_what_blender_cannot_hold_is_listed(tmp_path):

@@ -878,3 +878,21 @@ def test_a_long_focal_length_that_the_photos_determine_is_accepted(tmp_path: Pat
     assert far.model.num_reg_images() == 16
     (camera,) = far.model.cameras.values()
     assert camera.mean_focal_length() == pytest.approx(3600.0, rel=0.02)
+
+
+def test_many_photos_are_searched_again_for_as_many_features_as_few(solved: Solved, monkeypatch: pytest.MonkeyPatch):
+    job = replace(solved.job, max_features=2048)
+    tried = attempts.MappingAttempts(job, lambda *progress: None, lambda note: None)
+    searched: list[Job] = []
+    monkeypatch.setattr(attempts, "extract", lambda job, report: searched.append(job))
+    monkeypatch.setattr(attempts, "start_matching", lambda *arguments: None)
+    monkeypatch.setattr(attempts, "map_from_other_starts", lambda tried: None)
+    monkeypatch.setattr(tried, "match", lambda *arguments: None)
+    monkeypatch.setattr(tried, "map", lambda *arguments: None)
+    for photos, features in ((150, 8192), (151, 4096)):
+        tried.job, tried.photos = job, photos
+        assert tried.may_search_again()
+        attempts.map_with_more_features(tried)
+        assert searched.pop().max_features == features
+    assert tried.job.pairs == job.pairs
+    assert not tried.may_search_again()

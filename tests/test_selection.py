@@ -570,7 +570,7 @@ def test_a_sky_that_points_confirm_is_in_the_model_from_the_start():
     model, decisions = with_evidence(Components(), facts)
     assert model == Components(background="sphere")
     assert decisions[0].kept
-    assert decisions[0].seen == "20 % of the pixels look like a sky, with hardly any 3D point in front"
+    assert decisions[0].seen == "20 % of the pixels look like a sky, with hardly any surface in front"
     assert with_evidence(Components(), replace(facts, fixed=("background",)))[0] == Components()
     assert ("background", "sphere") not in changes_of(proposals(model, signs(0.0, 0.3), facts)[0])
 

@@ -101,7 +101,7 @@ def points_of_depths(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth])
         rays = world_rays(photo.frame.camera.bearings(depth.pixels[chosen] + 0.5), photo.frame.world_from_cam)
         points.append(photo.frame.centre + rays * depth.distances[chosen, None])
     found = np.concatenate(points)
-    return found[np.isfinite(found).all(axis=1)]
+    return found[np.isfinite(found).all(axis=1)][:MOST_POINTS]
 
 
 def points_before(masks: Sequence[np.ndarray], photos: Sequence[LoadedPhoto], points: np.ndarray) -> PointsBefore:

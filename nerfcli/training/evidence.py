@@ -53,7 +53,7 @@ class Evidence:
         cameras: the cameras against matched features.
         sky_fraction: fraction of the pixels that look like a sky, see `matching.sky`; 0 if that is enough for one, but
             3D points are in front.
-        sky_confirmed: whether these are enough for a sky, and 3D points are everywhere else.
+        sky_confirmed: whether these are enough for a sky, and 3D points or depths by stereo are everywhere else.
         sky: (pixels,) bool, the pixels of the pool that look like a sky; None if they are too few to be one. A plain
             background counts as one.
         track_depths: of points from structure from motion, or of matched features.

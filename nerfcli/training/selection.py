@@ -136,7 +136,7 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
     if facts.sensor:
         wanted.append((("sensor", True), f"a sensor has measured the depth of {facts.sensor:,} pixels"))
     if facts.sky_confirmed or facts.is_plain:
-        kind = "are a plain background" if facts.is_plain else "look like a sky, with hardly any 3D point in front"
+        kind = "are a plain background" if facts.is_plain else "look like a sky, with hardly any surface in front"
         reason = f"{100.0 * facts.sky_fraction:.0f} % of the pixels {kind}"
         wanted.append((("background", "sphere"), reason))
     wanted = [(change, reason) for change, reason in wanted if change[0] not in facts.fixed]

@@ -10,15 +10,20 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
+import numpy as np
+
 from nerfcli.atomic import write_json
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.axes import pose_in_axes
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import check_unique_names, read_json_object
+from nerfcli.captures.formats.fields import check_unique_names, malformed, read_json_object, shown
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.transforms import SPLITS, listed_frames, records_of, relative_path
 from nerfcli.captures.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole, refuse_spherical
-from nerfcli.errors import UserError, several
+from nerfcli.errors import UserError, listed
+
+# Of the files that list a view, the first one's split counts: a view that is trained on cannot be held out.
+_PRIORITY = ("train", "test", "val")
 
 
 def parse_blender(folder: Path, given: UserInputs = UserInputs()) -> Capture:
@@ -34,17 +39,22 @@ def parse_blender(folder: Path, given: UserInputs = UserInputs()) -> Capture:
             size = given.camera.size if given.camera else frames[0].camera.size if frames else None
             content = read_json_object(path)
             records = records_of(path, content)
-            listed, unknown, said = listed_frames(path, content, records, suffix=".png", images=given.images, size=size)
-            check_unique_names((frame.name for frame in listed), path)
-            frames += [replace(frame, split=split) for frame in listed]
+            views, unknown, said = listed_frames(path, content, records, suffix=".png", images=given.images, size=size)
+            check_unique_names((frame.name for frame in views), path)
+            frames += [replace(frame, split=split) for frame in views]
             missing += unknown
             notes += said
     if not frames:
         raise UserError(f"{_file(folder, 'train')}: No such file", "give a folder of transforms_{train,val,test}.json")
-    kept = {frame.name: frame for split in ("val", "test", "train") for frame in frames if frame.split == split}
-    if len(kept) < len(frames):
-        twice = several(len(frames) - len(kept), "view")
-        notes.append(f"{twice} in more than one of the files: used as of the first of train, test and val")
+    kept = dict[str, Frame]()
+    for frame in sorted(frames, key=lambda frame: _PRIORITY.index(frame.split or "train")):
+        first = kept.setdefault(frame.name, frame)
+        if not np.allclose(first.world_from_cam, frame.world_from_cam, rtol=0.0, atol=1e-6):
+            what = f"image {shown(frame.name)} is listed twice, with different poses"
+            raise malformed(folder, what, "remove one of its two entries")
+    repeated = [name for name, count in Counter(frame.name for frame in frames).items() if count > 1]
+    if repeated:
+        notes.append(f"listed in several files: {listed(repeated)}; used as of the first of train, test and val")
     frames = [frame for frame in frames if kept[frame.name] is frame]
     return Capture(tuple(frames), missing=tuple(missing), kind="blender", notes=tuple(notes))
 

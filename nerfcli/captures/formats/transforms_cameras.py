@@ -7,9 +7,11 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.formats import fields, lenses
-from nerfcli.captures.formats.fields import malformed, matrix
+from nerfcli.captures.formats.fields import malformed
 from nerfcli.captures.formats.lenses import Fits, Terms
 from nerfcli.captures.formats.limits import checked_camera
 from nerfcli.captures.formats.unsupported import distortion, projection
@@ -21,6 +23,7 @@ _MATRICES = ("K", "intrinsics", "intrinsic_matrix")
 _IN_MATRIX = {"fl_x": (0, 0), "fl_y": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 # Keys that give the same number; the first counts.
 _SAME = (("fl_x", "camera_angle_x"), ("fl_y", "camera_angle_y"))
+_FOCAL = {key for keys in _SAME for key in keys}
 # A smaller focal length, as a fraction of the picture's side, is no length in pixels: the view would be 178 degrees.
 _LEAST_FOCAL = 0.01
 # Rounding, and resizing to whole pixels, explain that two keys give focal lengths which differ by this fraction.
@@ -57,11 +60,12 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
         fits: takes a note where the terms are fitted by others.
     """
     width, height = size
-    record = _without_matrix(record, where)
     model = record.get("camera_model")
     model = model.strip().upper() if isinstance(model, str) else model
     if model == "EQUIRECTANGULAR":
         return checked_camera(model, *size, size, where=where)
+    if not any(record.get(key) not in (None, "") for key in _FOCAL):
+        record = record | _intrinsics_of(record)
     foreign = next((key for key in _FOREIGN if record.get(key) not in (None, False)), None)
     if foreign is not None:
         raise malformed(where, f"the lens model of {foreign} is not supported", "undistort the pictures first")
@@ -93,13 +97,24 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
     return checked_camera("PINHOLE", width, height, head, where=where)
 
 
-def _without_matrix(record: dict[str, Any], where: str) -> dict[str, Any]:
-    """Return the keys of a frame without focal length, but with a matrix of intrinsics, with the matrix's numbers."""
-    key = next((key for key in _MATRICES if record.get(key)), None)
-    if key is None or any(record.get(focal) is not None for keys in _SAME for focal in keys):
-        return record
-    values = matrix(record, key, (3,), 3, where)
-    return record | {name: float(values[place]) for name, place in _IN_MATRIX.items()}
+def _intrinsics_of(record: dict[str, Any]) -> dict[str, float]:
+    """Return focal lengths and principal point from the first matrix of intrinsics among a frame's keys, if any.
+
+    It has 3x3 numbers, or more rows and columns that do not matter, stored row by row or column by column.
+    """
+    for key in _MATRICES:
+        try:
+            values = np.array(record.get(key), dtype=np.float64)
+        except (TypeError, ValueError):
+            continue
+        values = values.reshape(3, 3) if values.shape == (9,) else values
+        if values.shape not in ((3, 3), (3, 4), (4, 4)):
+            continue
+        values = values[:3, :3]
+        for stored in (values, values.T):
+            if (stored[2] == (0.0, 0.0, 1.0)).all():
+                return {name: float(stored[place]) for name, place in _IN_MATRIX.items()}
+    return {}
 
 
 def merged(content: dict[str, Any], record: dict[str, Any]) -> dict[str, Any]:
@@ -108,8 +123,8 @@ def merged(content: dict[str, Any], record: dict[str, Any]) -> dict[str, Any]:
     Null and empty texts of a frame leave the value of the file.
     """
     own = {key: value for key, value in record.items() if value not in (None, "")}
-    focal = {key for keys in _SAME for key in keys}
-    unused = focal if (focal | set(_MATRICES)) & own.keys() else set[str]()
+    has_own = bool(_FOCAL & own.keys() or _intrinsics_of(own))
+    unused = _FOCAL | set(_MATRICES) if has_own else set[str]()
     return record | {key: value for key, value in content.items() if key not in unused} | own
 
 

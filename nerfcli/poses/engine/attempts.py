@@ -124,6 +124,10 @@ class MappingAttempts:
         limited = job.max_features < QUALITIES["best"][1] and max(feature_counts(job), default=0) >= job.max_features
         return larger or limited
 
+    def may_search_again(self) -> bool:
+        """Return whether another search of all photos is worth its time: of many, if the first was for few features."""
+        return self.photos <= _MOST_FOR_ALL or self.job.max_features < QUALITIES["default"][1]
+
     def have_unmatched_pairs(self) -> bool:
         """Return whether some pairs of photos have not been compared."""
         return len(self.job.pairs) < math.comb(self.photos, 2)
@@ -297,8 +301,11 @@ def map_with_more_features(attempts: MappingAttempts) -> None:
     """Search larger pictures for more features, within a time that grows with the fraction of missing photos."""
     job = attempts.job
     longest = max(max(group.width, group.height) for group in job.groups)
-    more = replace(job, variant="full-size", max_features=QUALITIES["best"][1], pairs=all_pairs(len(job.files)))
-    so_far = _search_seconds(job)
+    usual = max(job.max_features, QUALITIES["default"][1])  # many photos begin with half of them
+    more = replace(job, variant="full-size", max_features=usual)
+    if attempts.photos <= _MOST_FOR_ALL:
+        more = replace(more, max_features=QUALITIES["best"][1], pairs=all_pairs(len(job.files)))
+    so_far = _search_seconds(replace(job, max_features=usual))
     matching = matching_seconds(len(more.pairs), max_features=more.max_features)
     full = _search_seconds(replace(more, max_image_size=FULL_SIZE)) - matching
     allowed = _MOST_FOR_MORE * (1 - attempts.placed_fraction()) * so_far - matching
@@ -322,7 +329,7 @@ FALLBACKS: tuple[tuple[Callable[[MappingAttempts], bool], Callable[[MappingAttem
     (lambda a: a.connected_fraction() < _GOOD_FRACTION, map_from_other_starts),
     (lambda a: a.too_many_left_out() and a.photos <= _MOST_FOR_ALL and a.have_unmatched_pairs(), map_with_all_pairs),
     (
-        lambda a: a.placed_fraction() < _FEW_FRACTION and a.photos <= _MOST_FOR_ALL and a.can_have_more_features(),
+        lambda a: a.placed_fraction() < _FEW_FRACTION and a.can_have_more_features() and a.may_search_again(),
         map_with_more_features,
     ),
 )

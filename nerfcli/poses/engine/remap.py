@@ -39,8 +39,8 @@ _LEAST_APART = 0.05
 _LEAST_SECONDS = 60.0
 _GLOBALLY = "all photos at once (global mapper)"
 _MAY_LOOK_ALIKE = (
-    "photos of sides that look alike, as of a package, may still be joined wrongly: look at the result from all sides; "
-    "--masks can hide what repeats"
+    "photos of sides that look alike, such as those of a package, may still be joined wrongly: look at the result from "
+    "all sides; --masks can hide what repeats"
 )
 _Pairs = Set[frozenset[int]]  # of image ids
 
