@@ -36,9 +36,7 @@ def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]
     generator = np.random.default_rng(0)
     for one, (photo, depth) in enumerate(zip(photos, dense, strict=True)):
         chosen = generator.permutation(len(depth.pixels))[:2000]
-        pixels = depth.pixels[chosen]
-        bearings, _ = photo.frame.camera.bearings(pixels + 0.5)
-        points = apply(photo.frame.world_from_cam, bearings * depth.distances[chosen][:, None])
+        pixels, points = depth.pixels[chosen], depth.points(photo.frame, chosen)
         apart = np.linalg.norm(centres - centres[one], axis=1)
         for other in np.argsort(apart, kind="stable")[1:13].tolist():  # the nearest twelve
             second = photos[other]

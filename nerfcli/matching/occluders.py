@@ -99,8 +99,7 @@ class _Small:
         self.distances[cells[:, 1], cells[:, 0]] = depth.distances
         exact = np.flatnonzero(depth.errors < SAME_SURFACE)
         chosen = np.random.default_rng(0).permutation(exact)[:MOST_POINTS]
-        bearings, _ = camera.bearings(depth.pixels[chosen] + 0.5)
-        self.points = apply(photo.frame.world_from_cam, bearings * depth.distances[chosen, None])
+        self.points = depth.points(photo.frame, chosen)
         self.colours = self.levels[cells[chosen, 1], cells[chosen, 0]] / gain
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from nerfcli.matching.exposures import FEWEST_PIXELS
 from nerfcli.matching.stereo import DenseDepth
-from nerfcli.matching.tracks import MOST_POINTS, Tracks, triangulate, world_rays
+from nerfcli.matching.tracks import MOST_POINTS, Tracks, triangulate
 from nerfcli.photos.loading import LoadedPhoto
 
 # Size at which photos are compared, and number of other photos that each is compared with.
@@ -95,13 +95,10 @@ def points_of_depths(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth])
     """Return points (N, 3) of pixels whose depths are known within `MOST_ERROR`, in equal steps over all of them."""
     exact = [np.flatnonzero(depth.errors < MOST_ERROR) for depth in dense]
     step = math.ceil(sum(map(len, exact)) / MOST_POINTS) or 1
-    points = [np.zeros((0, 3))]
-    for photo, depth, numbers in zip(photos, dense, exact, strict=True):
-        chosen = numbers[::step]
-        rays = world_rays(photo.frame.camera.bearings(depth.pixels[chosen] + 0.5), photo.frame.world_from_cam)
-        points.append(photo.frame.centre + rays * depth.distances[chosen, None])
-    found = np.concatenate(points)
-    return found[np.isfinite(found).all(axis=1)][:MOST_POINTS]
+    chosen = zip(photos, dense, exact, strict=True)
+    return np.concatenate([depth.points(photo.frame, numbers[::step]) for photo, depth, numbers in chosen])[
+        :MOST_POINTS
+    ]
 
 
 def points_before(masks: Sequence[np.ndarray], photos: Sequence[LoadedPhoto], points: np.ndarray) -> PointsBefore:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import apply, inverse
 from nerfcli.matching.pair_stereo import forward_depths, sideways_depths
 from nerfcli.matching.stereo_view import BLOCK_PX, FACES, FEWEST_SHARED, Faces, View, seen_by, view_of
@@ -42,6 +43,11 @@ class DenseDepth:
     pixels: np.ndarray
     distances: np.ndarray
     errors: np.ndarray
+
+    def points(self, frame: Frame, chosen: np.ndarray) -> np.ndarray:
+        """Return the points (N, 3), in the scene's frame, of the pixels with these numbers."""
+        bearings, _ = frame.camera.bearings(self.pixels[chosen] + 0.5)
+        return apply(frame.world_from_cam, bearings * self.distances[chosen, None])
 
 
 def affordable_side_px(photos: Sequence[LoadedPhoto], *, seconds: float, threads: int) -> int:

@@ -107,7 +107,7 @@ def estimate_poses(
 class PreparedPhotos:
     """What is known before the work: the photos, their cameras, the pairs to match, and the plan.
 
-    settings: those of the search for features, which are others for panoramas.
+    settings: those of the search for features, which are others for panoramas and for many photos.
     """
 
     photos: Photos

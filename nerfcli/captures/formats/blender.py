@@ -46,17 +46,22 @@ def parse_blender(folder: Path, given: UserInputs = UserInputs()) -> Capture:
             notes += said
     if not frames:
         raise UserError(f"{_file(folder, 'train')}: No such file", "give a folder of transforms_{train,val,test}.json")
+    kept = _used_once(frames, folder)
+    repeated = [name for name, count in Counter(frame.name for frame in frames).items() if count > 1]
+    if repeated:
+        notes.append(f"listed in several files: {listed(repeated)}; used as of the first of train, test and val")
+    return Capture(tuple(kept), missing=tuple(missing), kind="blender", notes=tuple(notes))
+
+
+def _used_once(frames: list[Frame], folder: Path) -> list[Frame]:
+    """Return the frames without those that a file of higher priority lists as well, which must have the same pose."""
     kept = dict[str, Frame]()
     for frame in sorted(frames, key=lambda frame: _PRIORITY.index(frame.split or "train")):
         first = kept.setdefault(frame.name, frame)
         if not np.allclose(first.world_from_cam, frame.world_from_cam, rtol=0.0, atol=1e-6):
             what = f"image {shown(frame.name)} is listed twice, with different poses"
             raise malformed(folder, what, "remove one of its two entries")
-    repeated = [name for name, count in Counter(frame.name for frame in frames).items() if count > 1]
-    if repeated:
-        notes.append(f"listed in several files: {listed(repeated)}; used as of the first of train, test and val")
-    frames = [frame for frame in frames if kept[frame.name] is frame]
-    return Capture(tuple(frames), missing=tuple(missing), kind="blender", notes=tuple(notes))
+    return [frame for frame in frames if kept[frame.name] is frame]
 
 
 def losses_blender(capture: Capture) -> tuple[str, ...]:
