@@ -179,7 +179,7 @@ def train(
       near        true, false: smaller gradients near cameras
       distortion  a weight: concentrate the density along each ray
       antialias   true, false: fade out details smaller than a pixel; for photos from near and far
-      occluders   true, false: ignore what hides, in one photo, a surface that other photos see
+      occluders   true, false: ignore what hides a surface in one photo, or is attached to the camera
 
     Unless they are set with --with or --without, points, stereo, sensor, occluders, exposure, cameras, background and
     view are selected automatically. The first four and exposures from matched pixels are used where the photos support

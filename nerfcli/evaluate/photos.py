@@ -117,7 +117,7 @@ def held_out_photos(run: Run, frames: Sequence[Frame]) -> list[HeldOutPhoto]:
     known = run.cameras.exposures
     exposed = zip(photos, log_gains_of(frames, known).tolist(), gain_sources(frames, known), strict=True)
     return [
-        HeldOutPhoto(photo.frame, photo.pixels, photo.used, log_gains=tuple(gains), gains_from=source)
+        HeldOutPhoto(photo.frame, photo.pixels, run.used_pixels(photo), log_gains=tuple(gains), gains_from=source)
         for photo, gains, source in exposed
     ]
 

@@ -29,6 +29,12 @@ class LoadedPhoto:
     pixels: np.ndarray
     used: np.ndarray | None
 
+    def without(self, mask: np.ndarray | None) -> "LoadedPhoto":
+        """Return the photo with the pixels of a mask (H, W) not used either; None for none."""
+        if mask is None:
+            return self
+        return replace(self, used=~mask if self.used is None else self.used & ~mask)
+
 
 def load_photos(frames: Sequence[Frame], *, factor: float, threads: int, masks: str = "ignore") -> list[LoadedPhoto]:
     """Read, orient and downscale the photos of `frames`, in parallel, in order.

@@ -63,6 +63,8 @@ class TrainingInputs:
             if unknown or not used.
         occluders: for each photo of the pool the mask (height, width) bool of the pixels that are left out because
             something hides a surface there; None if the components keep them.
+        attached: the masks of what is attached to the camera, by the names of photos, held-out ones too; empty if
+            nothing is. The pool is without these pixels.
         seconds: seconds of the budget spent on evidence and trials, by name.
     """
 
@@ -78,6 +80,7 @@ class TrainingInputs:
     selection: Selection | None = None
     log_exposure: float | None = None
     occluders: list[np.ndarray] | None = None
+    attached: Mapping[str, np.ndarray] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
 
 

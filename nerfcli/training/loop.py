@@ -34,7 +34,9 @@ from nerfcli.training.sentinel import FAILURES, Sentinel
 
 
 def write_left_out(run: Path, inputs: TrainingInputs, *, notify: Callable[[str], None]) -> None:
-    """Write RUN/occluders/PHOTO.png, black where pixels are left out, for each photo with such pixels; report how many.
+    """Write RUN/occluders/PHOTO.png, black where pixels are left out, for each photo with such pixels.
+
+    Held-out photos have those of what is attached to the camera. Occluders are reported.
 
     Args:
         run: its folder; masks of an earlier training are replaced.
@@ -42,23 +44,24 @@ def write_left_out(run: Path, inputs: TrainingInputs, *, notify: Callable[[str],
     Raises:
         UserError: the masks cannot be written.
     """
-    if inputs.occluders is None:
+    if inputs.occluders is None and not inputs.attached:
         return
-    folder = run / OCCLUDERS
-    masks = {frame.name: mask for frame, mask in zip(inputs.pool.frames, inputs.occluders, strict=True)}
-    left_out = {name: 100.0 * float(mask.mean()) for name, mask in masks.items()}
-    most = sorted((name for name in left_out if left_out[name]), key=lambda name: -left_out[name])
+    folder, hidden = run / OCCLUDERS, {}
+    if inputs.occluders is not None:
+        hidden = {frame.name: mask for frame, mask in zip(inputs.pool.frames, inputs.occluders, strict=True)}
+    both = {name: mask | hidden.get(name, mask) for name, mask in inputs.attached.items()}
     shutil.rmtree(folder, ignore_errors=True)
-    write_masks(folder, {name: ~masks[name] for name in most})
-    if not most:
+    write_masks(folder, {name: ~mask for name, mask in (hidden | both).items() if mask.any()})
+    left_out = {name: 100.0 * float(mask.mean()) for name, mask in hidden.items()}
+    most = sorted((name for name in left_out if left_out[name]), key=lambda name: -left_out[name])
+    if most:
+        named = ", ".join(f"{name} {left_out[name]:.0f} %" for name in most[:3])
+        notify(
+            f"occluders: {np.mean(list(left_out.values())):.1f} % of the pixels left out, in {len(most)} of "
+            f"{len(hidden)} photos, most in {named}; masks in {folder}"
+        )
+    elif hidden:
         notify("occluders: none found")
-        return
-    named = ", ".join(f"{name} {left_out[name]:.0f} %" for name in most[:3])
-    mean = np.mean(list(left_out.values()))
-    notify(
-        f"occluders: {mean:.1f} % of the pixels left out, in {len(most)} of {len(masks)} photos, most in {named}; "
-        f"masks in {folder}"
-    )
 
 
 CHECKPOINT_SECONDS = 30.0

@@ -17,14 +17,16 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.loading import refuse_without_training_photos
 from nerfcli.errors import UserError, several
 from nerfcli.machine import default_memory_limit
+from nerfcli.matching.attached import attached_masks, lens_of
 from nerfcli.matching.correspondences import SharedFeatures
 from nerfcli.matching.plain_background import plain_background
 from nerfcli.matching.tracks import triangulate
 from nerfcli.photos.exif import mean_log_exposure, relative_log_exposures
+from nerfcli.photos.loading import downscaled_camera
 from nerfcli.training.evidence import LEARN_FOCAL, Evidence, TrainingPhotos, collect_evidence, tracks_of_model
 from nerfcli.training.extent import Extent, choose_extent, fits_object_frame, lacks_depth
 from nerfcli.training.fitting import TrainingInputs
-from nerfcli.training.pool import PixelPool, PointRays, load_album
+from nerfcli.training.pool import Album, PixelPool, PointRays, load_album
 from nerfcli.training.runs.components import LEARNED_BACKGROUNDS, Components, Selection
 from nerfcli.training.runs.run import RunConfig
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
@@ -74,14 +76,17 @@ def prepare(
     storage, text = storage_for(needs, memory_bytes, folder=run)
     notify(text)
     album = load_album(scene.train_frames, factor=factor, threads=threads, storage=storage, masks=masks)
-    shared = SharedFeatures(album.photos, lambda: tracks_of_model(scene, album.photos), threads=threads)
-    photos = TrainingPhotos(scene, album, shared)
+    photos = _photos(scene, album, threads)
     photos = replace(photos, plain=_plain_background(photos, settings, None if begun is None else begun.extent))
+    attached = _attached(photos, settings, factor, notify=notify)
+    if attached:
+        seen = tuple(photo.without(attached.get(photo.frame.name)) for photo in album.photos)
+        photos = _photos(scene, replace(album, photos=seen), threads)
 
     if begun is not None:
         settings = replace(settings, components=begun.config.components)
     extent = distributed.from_first(lambda: _extent(photos, settings, notify=notify) if begun is None else begun.extent)
-    pool = PixelPool(album.photos, extent.training_from_scene, device, colours=album.colours, storage=storage)
+    pool = PixelPool(photos.album.photos, extent.training_from_scene, device, colours=album.colours, storage=storage)
     camera = pool.cameras[0]
     notify(
         f"{len(pool.frames)} training photos, {len(scene.test_frames)} held out, {camera.width}x{camera.height} "
@@ -89,7 +94,7 @@ def prepare(
     )
     if pool.without_ray:
         notify(f"{pool.without_ray} pixels are skipped: they lie outside the lens model's field of view")
-    inputs = TrainingInputs(settings, extent, pool, factor=factor, storage=storage)
+    inputs = TrainingInputs(settings, extent, pool, factor=factor, storage=storage, attached=attached)
 
     is_new = begun is None
     evidence, selection = distributed.from_first(lambda: _decide(photos, inputs, is_new=is_new, notify=notify))
@@ -114,6 +119,36 @@ def prepare(
         log_focal=log_focal,
         seconds=seconds,
     )
+
+
+def _photos(scene: Capture, album: Album, threads: int) -> TrainingPhotos:
+    shared = SharedFeatures(album.photos, lambda: tracks_of_model(scene, album.photos), threads=threads)
+    return TrainingPhotos(scene, album, shared)
+
+
+def _attached(
+    photos: TrainingPhotos, settings: TrainSettings, factor: int, *, notify: Callable[[str], None]
+) -> dict[str, np.ndarray]:
+    """Return the masks of what is attached to the cameras, by the names of photos; report how much that is.
+
+    Held-out photos have those of the training photos of their camera. Before a plain background, nothing else tells
+    what moves with the camera.
+    """
+    if not settings.may_have_occluders or photos.plain is not None:
+        return {}
+    masks = attached_masks(photos.album.photos, threads=settings.threads)
+    scene, found = photos.scene, {}
+    for frame in (*scene.train_frames, *scene.test_frames):
+        mask = masks.get(lens_of(frame.name, downscaled_camera(frame.camera, factor).size))
+        if mask is not None:
+            found[frame.name] = mask
+    if found:
+        fraction = np.mean([mask.mean() for mask in found.values()])
+        notify(
+            f"attached to the camera: {100.0 * fraction:.1f} % of the pixels of {several(len(found), 'photo')} stay in "
+            "place while it moves, and are left out"
+        )
+    return found
 
 
 def _extent(photos: TrainingPhotos, settings: TrainSettings, *, notify: Callable[[str], None]) -> Extent:

@@ -53,10 +53,11 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
     )
     photos = (4 if may_have_alpha else 3) * sum(sizes) + 12 * sum(of_cameras.values())
     selects, components = settings.model == "auto", settings.components
-    may_have_occluders = components.occluders or (selects and "occluders" not in settings.fixed)
     # Masks of one byte, and the list of the pixels that they leave; occluders also have masks of the sky, and trials
     # train on pixels that they are not scored on.
-    photos += (9 * any(frame.mask is not None for frame in frames) + 10 * may_have_occluders + 9 * selects) * sum(sizes)
+    photos += (
+        9 * any(frame.mask is not None for frame in frames) + 10 * settings.may_have_occluders + 9 * selects
+    ) * sum(sizes)
     largest = max(frame.camera.width * frame.camera.height for frame in frames)
     # The field, its gradient and two moments, and the sentinel's copy of all of these except the gradient.
     field = planned_field(settings)

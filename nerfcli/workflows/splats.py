@@ -18,7 +18,6 @@ from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.notices import Notify, Reporter, silent
-from nerfcli.photos.images import read_image
 from nerfcli.photos.loading import LoadedPhoto, load_photos, pinhole_of
 from nerfcli.render.model import Model
 from nerfcli.splats.files import read_splats, write_splat_page, write_splats
@@ -35,7 +34,7 @@ from nerfcli.splats.refine import (
 )
 from nerfcli.splats.render import SplatScene, near_of
 from nerfcli.splats.start import count_for, gaussians_of_field
-from nerfcli.training.runs.files import OCCLUDERS, SPLATS
+from nerfcli.training.runs.files import SPLATS
 from nerfcli.training.runs.run import Run
 from nerfcli.version import __version__
 
@@ -231,12 +230,9 @@ def _as_trained(run: Run, loaded: Sequence[LoadedPhoto]) -> list[LoadedPhoto]:
     has_ray = cache(lambda camera: camera.pixel_bearings()[1])
     photos = []
     for photo in loaded:
-        used = has_ray(photo.frame.camera).reshape(photo.pixels.shape[:2])
-        if photo.used is not None:
-            used = used & photo.used
-        occluders = run.path / OCCLUDERS / f"{photo.frame.name}.png"
-        if occluders.exists():
-            used = used & (read_image(occluders)[..., 0] > 0)
+        used, counting = has_ray(photo.frame.camera).reshape(photo.pixels.shape[:2]), run.used_pixels(photo)
+        if counting is not None:
+            used = used & counting
         photos.append(replace(photo, used=None if used.all() else used))
     return photos
 

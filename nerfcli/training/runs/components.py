@@ -50,8 +50,8 @@ class Components:
         distortion: weight of `kernels.RaySums.distortion`; 0.05 is best or as good as any on real and synthetic
             captures.
         antialias: whether details smaller than a pixel fade out of its view; see `reference.hash_encode`.
-        occluders: whether pixels are left out where something hides a surface that other photos see; see
-            `matching.occluders`.
+        occluders: whether pixels are left out where something hides a surface that other photos see, or is attached to
+            the camera; see `matching.occluders` and `matching.attached`.
     """
 
     background: str = "auto"

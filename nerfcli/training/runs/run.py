@@ -9,6 +9,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from nerfcli.atomic import read_json, read_sealed, write_sealed
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.registry import photo_folder, recognised
@@ -17,9 +19,11 @@ from nerfcli.captures.loading import fingerprint
 from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.errors import UserError, in_shell
 from nerfcli.field.checkpoint import load_tensors
+from nerfcli.photos.images import read_image
+from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.model import Model, load_model
 from nerfcli.training.runs.components import Components, Decision, Selection, differences
-from nerfcli.training.runs.files import CONFIG, FIELD, METRICS, STATE, LogEntry, TrainingSummary, read_log
+from nerfcli.training.runs.files import CONFIG, FIELD, METRICS, OCCLUDERS, STATE, LogEntry, TrainingSummary, read_log
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.version import __version__
 
@@ -259,6 +263,17 @@ class Run:
     def metrics_path(self) -> Path:
         """RUN/metrics.json."""
         return self.path / METRICS
+
+    def used_pixels(self, photo: LoadedPhoto) -> np.ndarray | None:
+        """Return which pixels (H, W) of a photo of the training's size count; None for all.
+
+        Not those of its mask, nor those that the training has left out of it.
+        """
+        left_out = self.path / OCCLUDERS / f"{photo.frame.name}.png"
+        if not left_out.exists():
+            return photo.used
+        kept = read_image(left_out)[..., 0] > 0
+        return kept if photo.used is None else kept & photo.used
 
     def model(self, device: str = "cpu") -> Model:
         """Load the field with everything that rendering needs; each call loads it again.

@@ -113,6 +113,11 @@ class TrainSettings:
         return min(self.first_samples_per_step or first, most), most
 
     @property
+    def may_have_occluders(self) -> bool:
+        """Whether pixels may be left out where something hides the scene."""
+        return self.components.occluders or (self.model == "auto" and "occluders" not in self.fixed)
+
+    @property
     def on_gpu(self) -> bool:
         """Whether the device is a GPU."""
         return self.device.startswith("cuda")

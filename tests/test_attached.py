@@ -1,0 +1,165 @@
+"""What is attached to the camera: painted into photos of textured walls, at the same place in each of them."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from test_stereo import TEXTURE, truth
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import rotation_from_vector
+from nerfcli.captures.capture import Capture
+from nerfcli.captures.loading import load_scene
+from nerfcli.evaluate.photos import held_out_photos
+from nerfcli.matching.attached import FEWEST_PHOTOS, attached_masks
+from nerfcli.photos.images import write_png
+from nerfcli.photos.loading import LoadedPhoto
+from nerfcli.training.loop import train
+from nerfcli.training.runs.run import Run
+from nerfcli.training.runs.settings import TrainSettings
+
+CAMERA = Camera.pinhole(320, 240, 300.0)
+STEPS = np.linspace(-1.0, 1.0, 9)
+
+
+def outline(*corners: tuple[int, int]) -> np.ndarray:
+    return cv2.fillPoly(np.zeros((240, 320), np.uint8), [np.array(corners)], 1) > 0
+
+
+GRIPPER = outline((250, 240), (262, 150), (285, 140), (300, 200), (300, 240))
+WATERMARK = outline((14, 200), (50, 196), (46, 226), (20, 230))
+BONNET = outline((0, 215), (160, 190), (320, 215), (320, 240), (0, 240))
+BARS = outline((0, 0), (320, 0), (320, 24), (0, 24)) | outline((0, 216), (320, 216), (320, 240), (0, 240))
+POLE = outline((296, 0), (304, 0), (304, 240), (296, 240))
+
+
+def walls(where: np.ndarray | None = None, *, colour: float = 30.0, count: int = len(STEPS)) -> list[LoadedPhoto]:
+    """Return photos of walls by a camera that moves and turns irregularly, with a thing of one colour painted into each."""
+    shown = []
+    for step in STEPS[:count]:
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_from_vector(np.array([0.1 * np.cos(5.0 * step), 0.2 * np.sin(7.0 * step), 0.05 * step]))
+        pose[0, 3] = 0.6 * step
+        x, y = (truth(CAMERA, pose)[1][..., axis].astype(np.float32) * 130 + 450 for axis in (0, 1))
+        grey = np.clip(128 + 1.5 * (cv2.remap(TEXTURE, x, y, cv2.INTER_CUBIC) - 128), 0, 255).astype(np.uint8)
+        shown.append(LoadedPhoto(Frame(f"{step}.png", CAMERA, pose), np.repeat(grey[..., None], 3, axis=2), None))
+    return shown if where is None else [painted(one, where, colour) for one in shown]
+
+
+def painted(one: LoadedPhoto, where: np.ndarray, colour: float) -> LoadedPhoto:
+    return replace(one, pixels=np.where(where[..., None], colour, one.pixels).astype(np.uint8))
+
+
+def mask_of(photos: list[LoadedPhoto]) -> np.ndarray | None:
+    (mask,) = attached_masks(photos, threads=2).values() or (None,)
+    return mask
+
+
+def grown(mask: np.ndarray, by_px: int) -> np.ndarray:
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * by_px + 1, 2 * by_px + 1), np.uint8)) > 0
+
+
+@pytest.mark.parametrize("where", [GRIPPER, WATERMARK, BONNET, BARS], ids=["gripper", "watermark", "bonnet", "bars"])
+def test_what_stays_in_place_is_found_with_its_edge(where):
+    mask = mask_of(walls(where))
+    assert mask is not None
+    assert mask[where].all()
+    assert not mask[~grown(where, 8)].any()
+
+
+def test_it_may_shake_and_be_lit_differently():
+    shaken = []
+    for number, one in enumerate(walls()):
+        moved = np.roll(GRIPPER, (number % 2, number // 3 - 1), axis=(0, 1))
+        shaken.append(painted(one, moved, 20.0 + 5.0 * (number % 3)))
+    mask = mask_of(shaken)
+    assert mask is not None
+    assert mask[GRIPPER].mean() > 0.95
+    assert not mask[~grown(GRIPPER, 10)].any()
+
+
+@pytest.mark.parametrize(
+    "photos",
+    [
+        walls(),
+        walls(GRIPPER, count=FEWEST_PHOTOS - 1),
+        walls(outline((130, 100), (190, 100), (190, 140), (130, 140))),
+        [painted(one, GRIPPER, 30.0) if number < 6 else one for number, one in enumerate(walls())],
+        [replace(one, pixels=np.dstack([one.pixels, GRIPPER * np.uint8(255)])) for one in walls(GRIPPER)],
+        [replace(one, frame=replace(one.frame, name=f"{n}/a.png")) for n, one in enumerate(walls(GRIPPER))],
+    ],
+    ids=["nothing", "few photos", "in the middle", "in some photos", "alpha", "a camera for each photo"],
+)
+def test_nothing_else_is_taken_for_attached(photos):
+    assert attached_masks(photos, threads=2) == {}
+
+
+@pytest.mark.parametrize("motion", ["around", "along", "past"])
+def test_an_edge_that_the_scene_may_have_there_is_none(motion):
+    """A pole around which the camera turns, or along which it moves, has its place in all photos; not one it passes."""
+    photos = []
+    for number, step in enumerate(STEPS):
+        pose = np.eye(4)
+        if motion == "along":
+            pose[1, 3] = step
+        else:  # it turns, around the pole at column 300, which is 4 before it, or while it moves past
+            pose[:3, :3] = rotation_from_vector(np.array([0.0, 0.4 * step, 0.0]))
+            pose[:3, 3] = -pose[:3, :3] @ (4.0 * 140.0 / 300.0, 0.0, 4.0) if motion == "around" else (step, 0.0, 0.0)
+        noise = np.random.default_rng(number).uniform(90, 250, (240, 320)).astype(np.float32)
+        pixels = np.repeat(cv2.GaussianBlur(noise, (0, 0), 2)[..., None], 3, axis=2).astype(np.uint8)
+        photos.append(painted(LoadedPhoto(Frame(f"{number}.png", CAMERA, pose), pixels, None), POLE, 20.0))
+    mask = mask_of(photos)
+    assert (mask is not None) == (motion == "past")
+    assert mask is None or mask[POLE].all()
+
+
+def test_cameras_have_masks_of_their_own():
+    left, right = (
+        [replace(one, frame=replace(one.frame, name=f"{side}/{one.frame.name}")) for one in walls(where)]
+        for side, where in (("left", GRIPPER), ("right", WATERMARK))
+    )
+    masks = {folder.name: mask for (folder, _), mask in attached_masks([*left, *right], threads=2).items()}
+    assert masks["left"][GRIPPER].all()
+    assert masks["right"][WATERMARK].all()
+    assert not (masks["left"] & masks["right"]).any()
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Capture:
+    """Photos with a gripper, of which the last one is held out."""
+    frames = []
+    for number, one in enumerate(walls(GRIPPER)):
+        write_png(tmp_path / "walls" / "images" / f"{number}.png", one.pixels)
+        pose = one.frame.world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": f"images/{number}.png", "transform_matrix": pose.tolist()})
+    named = [frame["file_path"] for frame in frames]
+    split = {"train_filenames": named[:-1], "test_filenames": named[-1:]}
+    lens = {"w": 320, "h": 240, "fl_x": 300.0, "fl_y": 300.0, "cx": 160.0, "cy": 120.0}
+    (tmp_path / "walls" / "transforms.json").write_text(json.dumps({**lens, "frames": frames, **split}))
+    return load_scene(tmp_path / "walls")
+
+
+@pytest.mark.parametrize("fixed", [(), ("occluders",)], ids=["by default", "without occluders"])
+def test_training_and_evaluation_leave_it_out(capture, tmp_path, fixed):
+    chosen = TrainSettings(
+        budget_seconds=None, steps=20, first_samples_per_step=2**9, samples_per_step=2**9, log2_rows=10, model="auto",
+        fixed=fixed,
+    )  # fmt: skip
+    notes: list[str] = []
+    train(capture, tmp_path / "run", chosen, resume=False, notify=notes.append, on_progress=lambda progress: None)
+    written = {path.name for path in (tmp_path / "run" / "occluders").rglob("*.png")}
+    told = [note for note in notes if note.startswith("attached to the camera: ") and "of 9 photos" in note]
+    run = Run(tmp_path / "run")
+    (held_out,) = held_out_photos(run, run.cameras.test)
+    if fixed:
+        assert (written, told, held_out.used) == (set(), [], None)
+        return
+    assert written == {f"{number}.png.png" for number in range(9)}
+    assert len(told) == 1
+    assert held_out.used is not None
+    assert not held_out.used[GRIPPER].any()
+    assert held_out.used[~grown(GRIPPER, 8)].all()
