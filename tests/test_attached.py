@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from test_stereo import TEXTURE, truth
 
 from nerfcli.cameras.camera import Camera
@@ -16,8 +17,11 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.loading import load_scene
 from nerfcli.evaluate.photos import held_out_photos
 from nerfcli.matching.attached import FEWEST_PHOTOS, attached_masks
-from nerfcli.photos.images import write_png
+from nerfcli.photos.images import read_image, write_png
 from nerfcli.photos.loading import LoadedPhoto
+from nerfcli.poses.engine import turntable
+from nerfcli.poses.engine.turntable import mask_turning_object, recall_masks
+from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.training.loop import train
 from nerfcli.training.runs.run import Run
 from nerfcli.training.runs.settings import TrainSettings
@@ -38,7 +42,7 @@ POLE = outline((296, 0), (304, 0), (304, 240), (296, 240))
 
 
 def walls(where: np.ndarray | None = None, *, colour: float = 30.0, count: int = len(STEPS)) -> list[LoadedPhoto]:
-    """Return photos of walls by a camera that moves and turns irregularly, with a thing of one colour painted into each."""
+    """Return photos of walls by a camera that moves irregularly, with a thing of one colour painted into each."""
     shown = []
     for step in STEPS[:count]:
         pose = np.eye(4)
@@ -163,3 +167,28 @@ def test_training_and_evaluation_leave_it_out(capture, tmp_path, fixed):
     assert held_out.used is not None
     assert not held_out.used[GRIPPER].any()
     assert held_out.used[~grown(GRIPPER, 8)].all()
+
+
+def test_no_features_are_searched_for_on_it(tmp_path):
+    """The masks of pycolmap are those of the next call, too; if one is lost, all are made again."""
+    work, names = tmp_path / "scene" / "work", tuple(f"{number}.png" for number in range(len(STEPS)))
+    (work / "photos").mkdir(parents=True)
+    for name, one in zip(names, walls(GRIPPER), strict=True):
+        Image.fromarray(one.pixels).save(work / "photos" / name)
+    job = Job(
+        folder=str(work), files=names, originals=str(work / "photos"), names=names, keys=names,
+        groups=(CameraGroup(tuple(range(len(names))), "PINHOLE", 320, 240),), pairs=(), neighbours=0,
+        max_image_size=320, max_features=500, seed=0, threads=1,
+    )  # fmt: skip
+    notes: list[str] = []
+    masked, facts = mask_turning_object(job, notes.append)
+    assert facts is None
+    assert [note for note in notes if note.startswith("attached to the camera: ")] == notes != []
+    for name in names:
+        used = read_image(work / "masks" / f"{name}.png")[..., 0] > 0
+        assert not used[GRIPPER].any()
+        assert used[~grown(GRIPPER, 8)].all()
+    assert not turntable.scene_masks(job).exists()
+    assert recall_masks(job) == (masked, None)
+    (work / "masks" / f"{names[3]}.png").unlink()
+    assert recall_masks(job) is None

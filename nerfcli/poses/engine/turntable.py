@@ -23,6 +23,7 @@ from nerfcli.matching.features import LOOSE_RATIO, Features, find_features, mutu
 from nerfcli.matching.stationary import Motions, Stationary, in_place, motions, together
 from nerfcli.photos.images import image_size, read_image
 from nerfcli.photos.masks import read_mask
+from nerfcli.poses.engine.attached import mask_attached, recall_attached
 from nerfcli.poses.engine.features import feature_keys
 from nerfcli.poses.input import still_background as still
 from nerfcli.poses.input.job import Job, Tell, WorkMask, file_key, read_stage, stage_key, write_stage
@@ -40,7 +41,7 @@ _MOST_POSITIONS = 8
 _LEAST_RIGHT = 0.7
 _WHITE = (0.003, 0.9)
 # Change this whenever this module would find other masks or facts.
-_VERSION = "two motions, displaced backgrounds"
+_VERSION = "two motions, displaced backgrounds, attached things"
 _STAGE = "turntable.json"
 # Hashes of each photo and of its mask as written, by the photo's name, so that masks that were edited since are kept.
 _WRITTEN = "turntable-masks.json"
@@ -81,6 +82,10 @@ class _Photos:
         with ThreadPoolExecutor(self._job.threads) as pool:
             self._read.update(zip(missing, pool.map(self._photo, missing), strict=True))
 
+    def pictures(self, numbers: Collection[int]) -> dict[int, np.ndarray]:
+        """Return the reduced pictures of those of the photos that have been read."""
+        return {number: photo.picture for number, photo in self._read.items() if number in numbers}
+
     def _photo(self, number: int) -> _Photo:
         pixels = np.ascontiguousarray(read_image(self._job.photos / self._job.files[number])[..., :3])
         grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
@@ -111,6 +116,9 @@ def recall_masks(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
     content = read_stage(Path(job.folder) / _STAGE, _key(job))
     if content is None:
         return None
+    if content.get("attached"):
+        masked = recall_attached(job)
+        return None if masked is None else (masked, content if "found" in content else None)
     if not content or not content["masked"]:
         return job, content or None
     unmasked = [name for name in content["unmasked"] if not (scene_masks(job) / f"{name}.png").is_file()]
@@ -132,17 +140,20 @@ def recall_masks(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
 def mask_turning_object(job: Job, tell: Tell) -> tuple[Job, dict[str, Any] | None]:
     """Return the job with masks of the object, if one turns in front of a static background, and the facts to report.
 
-    The job is unchanged if no masks can be accepted; the facts are None if there is nothing to report. Held-out photos
-    get masks too, but only training photos decide whether and which. `tell` receives what was found.
+    If none does, masks are those of what is attached to the camera. The job is unchanged if no masks can be accepted;
+    the facts are None if there is nothing to report. Held-out photos get masks too, but only training photos decide
+    whether and which. `tell` receives what was found.
     """
     photos = _Photos(job)
     training = [number for number in range(len(job.files)) if number not in job.held_out]
     compared = _compare_photos(photos, training)
     motions = _together(compared)
+    attached = None if motions.found else mask_attached(job, photos.pictures(training), tell)
+    facts: dict[str, Any] = {} if attached is None else {"attached": True}
     if not motions.two_motions:
-        write_stage(Path(job.folder) / _STAGE, _key(job), {})
-        return job, None
-    facts: dict[str, Any] = {
+        write_stage(Path(job.folder) / _STAGE, _key(job), facts)
+        return attached or job, None
+    facts |= {
         "pairs": motions.two + motions.still + motions.moved,
         "pairs_two_motions": motions.two,
         "pairs_still": motions.still,
@@ -164,7 +175,7 @@ def mask_turning_object(job: Job, tell: Tell) -> tuple[Job, dict[str, Any] | Non
     if facts["masked"]:
         job = replace(job, masks=_write_masks(job, masks, edited))
     write_stage(Path(job.folder) / _STAGE, _key(job), facts)
-    return job, facts
+    return attached or job, facts
 
 
 def describe_motions(facts: dict[str, Any]) -> str:
