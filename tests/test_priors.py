@@ -203,6 +203,28 @@ def test_a_known_surface_that_is_nearly_empty_gets_eleven_times_the_gradient():
     assert gradients[1] / gradients[0] == pytest.approx(11.0, rel=1e-4)
 
 
+def test_cameras_with_an_impossible_lens_are_named_and_not_called_exact(spheres, tmp_path, monkeypatch):
+    """Their distortion turns back within the picture, so that most pixels have no ray."""
+
+    monkeypatch.setattr("nerfcli.training.selection.FEWEST_STEPS", 1)
+    monkeypatch.setattr("nerfcli.training.schedule.FEWEST_STEPS", 1)
+
+    def notes(spheres: Capture) -> str:
+        reported: list[str] = []
+        settings = TrainSettings(budget_seconds=None, steps=40, downscale=8, model="auto", log2_rows=10)
+        prepare(spheres, settings, run=tmp_path, notify=reported.append)
+        return "\n".join(reported)
+
+    width, height = (focal := spheres.frames[0].camera).size
+    bent = Camera("RADIAL", width, height, (focal.focal_px, width / 2, height / 2, -20.0, 0.0))
+    broken = replace(spheres, frames=tuple(replace(frame, camera=bent) for frame in spheres.frames))
+    assert "these cameras are exact" in notes(spheres)
+    told = notes(broken)
+    assert "these cameras are exact" not in told
+    assert "% of the pixels are skipped" in told
+    assert "Its distortion must be wrong: estimate the cameras with nerfcli poses PHOTOS" in told
+
+
 def test_known_distances_are_a_log_likelihood_only_until_surfaces_have_emerged(capture, tmp_path, monkeypatch):
     settings = TrainSettings(budget_seconds=None, steps=10, components=Components(points=0.1))
     inputs = prepare(capture, settings, run=tmp_path, notify=lambda text: None)

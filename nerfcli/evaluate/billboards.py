@@ -71,8 +71,8 @@ class GeometryEvidence:
             needed = max(LEAST_GAIN_DB, STANDARD_ERRORS * (self.error_db or 0.0))
             compared = f"{compared}; it takes a gain of {needed:.1f} dB to be sure"
         return (
-            f"no evidence of geometry: {compared}. The training was too short, or these photos do not determine "
-            "depth (the camera only turned, too few photos, a flat scene): do not trust its depth"
+            f"no evidence of geometry: {compared}. The training was too short, the cameras are wrong, or these photos "
+            "do not determine depth (the camera only turned, too few photos, a flat scene): do not trust its depth"
         )
 
 

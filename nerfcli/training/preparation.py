@@ -35,6 +35,9 @@ from nerfcli.training.selection import Facts, select, with_evidence, with_known_
 from nerfcli.training.storage import check_device_memory, needs_of, storage_for
 from nerfcli.training.trials import Trials
 
+# Even a circular fisheye leaves a smaller fraction of a picture of 16:9 without rays.
+MOST_WITHOUT_RAY = 0.6
+
 
 @dataclass(frozen=True)
 class EarlierDecisions:
@@ -93,7 +96,7 @@ def prepare(
         f"(1/{factor}), {extent}, {settings.device}, {several(threads, 'thread')}"
     )
     if pool.without_ray:
-        notify(f"{pool.without_ray} pixels are skipped: they lie outside the lens model's field of view")
+        notify(_without_ray(pool))
     inputs = TrainingInputs(settings, extent, pool, factor=factor, storage=storage, attached=attached)
 
     is_new = begun is None
@@ -248,9 +251,18 @@ def _facts(photos: TrainingPhotos, settings: TrainSettings, evidence: Evidence) 
     )
 
 
+def _without_ray(pool: PixelPool) -> str:
+    """Say that pixels have no ray, and what that means if they are most of them."""
+    fraction = pool.without_ray / len(pool.colours)
+    note = f"{100.0 * fraction:.2g} % of the pixels are skipped: they lie outside the lens model's field of view"
+    if fraction <= MOST_WITHOUT_RAY:
+        return note
+    return f"{note}. Its distortion must be wrong: estimate the cameras with nerfcli poses PHOTOS"
+
+
 def _known(scene: Capture) -> str | None:
     """Return the reason to trust the cameras, shown to the user; None if they may be wrong."""
-    if scene.kind == "blender":
+    if scene.kind == "blender" and all(frame.camera.model == "PINHOLE" for frame in scene.frames):
         return "these cameras are exact: the pictures were rendered with them"
     return "structure from motion has already optimized the cameras" if len(scene.points) else None
 
