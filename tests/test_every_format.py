@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,19 @@ def test_a_capture_with_photos_is_trained_on(name, tmp_path):
     assert re.fullmatch(rf"{tmp_path}.*: {kind} \(.+\), 3 of 3 photos on disk", describe_source(place, scene))
     if file.is_file() and name not in ("nerfcli", "polycam", "mvsnet", "pose-files"):  # found by a file, not a folder
         assert load_scene(file).kind == kind
+
+
+def test_photos_that_a_colmap_model_does_not_place_are_counted(tmp_path):
+    """Regression: a model of 3 of 87 photos was trained on without a word about the others."""
+    WITH_PHOTOS["colmap"](VIEWS, tmp_path)
+    scene = load_scene(tmp_path)
+    first = scene.frames[0].image
+    assert first is not None
+    for name in ("y.jpg", "z.jpg", "notes.txt"):
+        shutil.copy(first, first.with_name(name))
+    text = describe_source(tmp_path, scene)
+    assert "3 of 3 photos on disk; 2 photos beside them, such as y.jpg, without a pose" in text
+    assert text.endswith(f"run nerfcli poses {first.parent}")
 
 
 @pytest.mark.parametrize("name", WITH_PHOTOS)

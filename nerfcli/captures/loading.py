@@ -18,7 +18,8 @@ from nerfcli.captures.formats.registry import recognise
 from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.captures.holdout import HELD_OUT_EVERY, default_split, names_held_out
 from nerfcli.captures.orientation import UPRIGHT, counted, rescaling, upright
-from nerfcli.errors import UserError, in_shell
+from nerfcli.errors import UserError, in_shell, several
+from nerfcli.photos.images import list_images
 from nerfcli.photos.masks import masks_inside
 
 
@@ -171,4 +172,17 @@ def describe_source(path: Path, scene: Capture) -> str:
     """Describe which file or folder a scene at `path` was read from, in which format, and how many photos it has."""
     form, found = recognise(path)
     there = len(scene.frames)
-    return f"{found}: {form.name} ({form.of}), {there} of {there + len(scene.missing)} photos on disk"
+    text = f"{found}: {form.name} ({form.of}), {there} of {there + len(scene.missing)} photos on disk"
+    without_pose = _without_pose(scene) if scene.kind.startswith("colmap") else []
+    if not without_pose:
+        return text
+    return (
+        f"{text}; {several(len(without_pose), 'photo')} beside them, such as {without_pose[0].name}, without a pose: "
+        f"for poses of all, run nerfcli poses {in_shell(without_pose[0].parent)}"
+    )
+
+
+def _without_pose(scene: Capture) -> list[Path]:
+    """Return the photos in the folders of a scene's photos that the scene does not have."""
+    images = [frame.image for frame in scene.frames if frame.image is not None]
+    return sorted({file for folder in {image.parent for image in images} for file in list_images(folder)} - {*images})
