@@ -421,6 +421,22 @@ def test_photos_in_files_give_the_same_rays_as_in_memory(alpha, masked, tmp_path
     assert not list((tmp_path / "room").iterdir())  # files without a name
 
 
+@pytest.mark.parametrize("transparent", [False, True])
+def test_alpha_that_is_opaque_in_all_photos_is_none(transparent, tmp_path):
+    """Regression: a flower before black, in PNGs with opaque alpha, was taken for a cut-out in a bounded black box."""
+    frames = []
+    for index in range(2):
+        pixels = np.random.default_rng(index).integers(0, 255, (14, 20, 4), dtype=np.uint8)
+        pixels[..., 3] = 0 if transparent and index else 255
+        write_png(tmp_path / f"{index}.png", pixels)
+        camera = Camera("SIMPLE_PINHOLE", 20, 14, (15.0, 10.0, 7.0))
+        frames.append(Frame(f"{index}.png", camera, np.eye(4), tmp_path / f"{index}.png"))
+    _, album, pool = drawn_from(frames, IN_MEMORY)
+    assert pool.has_alpha == transparent
+    assert album.fills_frame != transparent
+    assert {photo.pixels.shape[-1] for photo in load_photos(frames, factor=1, threads=1)} == {4 if transparent else 3}
+
+
 def test_pages_are_given_back_beyond_the_limit(tmp_path):
     room = InFiles(tmp_path, resident_bytes(os.getpid()) + 2**23)
     before = resident_bytes(os.getpid())

@@ -37,7 +37,7 @@ class LoadedPhoto:
 
 
 def load_photos(frames: Sequence[Frame], *, factor: float, threads: int, masks: str = "ignore") -> list[LoadedPhoto]:
-    """Read, orient and downscale the photos of `frames`, in parallel, in order.
+    """Read, orient and downscale the photos of `frames`, in parallel, in order; alpha that is opaque in all is dropped.
 
     Args:
         frames: with their images and masks.
@@ -47,7 +47,15 @@ def load_photos(frames: Sequence[Frame], *, factor: float, threads: int, masks: 
         UserError: a photo cannot be read, or has another size than its camera.
     """
     with ThreadPoolExecutor(max(1, threads)) as pool:
-        return list(pool.map(lambda frame: load_photo(frame, factor, masks), frames))
+        photos = list(pool.map(lambda frame: load_photo(frame, factor, masks), frames))
+    if any(is_transparent(photo.pixels) for photo in photos):
+        return photos
+    return [replace(photo, pixels=photo.pixels[..., :3]) for photo in photos]
+
+
+def is_transparent(pixels: np.ndarray) -> bool:
+    """Return whether a picture (H, W, 3 or 4) is transparent anywhere; many programs write alpha that is opaque."""
+    return pixels.shape[-1] == 4 and bool(pixels[..., 3].min() < 255)
 
 
 def load_photo(frame: Frame, factor: float, masks: str) -> LoadedPhoto:

@@ -16,7 +16,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.kernels import BearingGrids, PixelTable, backend_for
-from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photo
+from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, is_transparent, load_photo
 from nerfcli.training.storage import IN_MEMORY, PhotoStorage
 
 
@@ -117,8 +117,8 @@ class Album:
 
     Args:
         photos: their pixels are views of `colours`; if any photo has alpha, those without are opaque.
-        colours: (pixels of all photos, 3 or 4) uint8.
-        fills_frame: True if any photo has no alpha of its own.
+        colours: (pixels of all photos, 3 or 4) uint8; 4 if any photo is transparent somewhere.
+        fills_frame: True if any photo has no alpha of its own, or if alpha is opaque in all photos.
     """
 
     photos: tuple[LoadedPhoto, ...]
@@ -136,18 +136,19 @@ def load_album(
     """
     cameras = [downscaled_camera(frame.camera, factor) for frame in frames]
     begins = np.cumsum([0, *(camera.width * camera.height for camera in cameras)])
-    # Alpha is known only after decoding: start with three channels, and restart with four if a photo has alpha.
+    # Alpha is known only after decoding: start with three channels, and restart with four if a photo is transparent.
     for channels in (3, 4):
         colours = storage.array((int(begins[-1]), channels), np.uint8)
         fills: list[bool] = []
 
         def place(index: int, colours: np.ndarray = colours) -> tuple[LoadedPhoto, bool] | None:
             photo = load_photo(frames[index], factor, masks)
-            has_alpha = photo.pixels.shape[-1] == 4
-            if has_alpha and colours.shape[-1] == 3:
+            kept = colours.shape[-1]
+            if kept == 3 and is_transparent(photo.pixels):
                 return None
+            has_alpha = photo.pixels.shape[-1] == kept == 4
             part = colours[begins[index] : begins[index + 1]].reshape(*photo.pixels.shape[:2], -1)
-            part[...] = photo.pixels if has_alpha or colours.shape[-1] == 3 else _with_alpha(photo.pixels)
+            part[...] = photo.pixels[..., :kept] if has_alpha or kept == 3 else _with_alpha(photo.pixels)
             storage.release_pages()
             return replace(photo, pixels=part), not has_alpha
 
