@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import mpmath
 import numpy as np
@@ -33,6 +34,7 @@ from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import point_weight
 from nerfcli.training.selection import Facts
+from nerfcli.training.step import NonFiniteError
 
 CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
 # Both cameras see them; the first point is off by half a pixel in the second camera.
@@ -223,6 +225,17 @@ def test_cameras_with_an_impossible_lens_are_named_and_not_called_exact(spheres,
     assert "these cameras are exact" not in told
     assert "% of the pixels are skipped" in told
     assert "Its distortion must be wrong: estimate the cameras with nerfcli poses PHOTOS" in told
+
+
+def test_trials_that_become_non_finite_end_without_an_error(capture, tmp_path, monkeypatch):
+    """Components that photos support are still selected."""
+    monkeypatch.setattr("nerfcli.training.schedule.FEWEST_STEPS", 1)
+    monkeypatch.setattr(Fitting, "advance", Mock(side_effect=NonFiniteError))
+    reported: list[str] = []
+    settings = TrainSettings(budget_seconds=None, steps=40, model="auto", log2_rows=10)
+    inputs = prepare(capture, settings, run=tmp_path, notify=reported.append)
+    assert "numbers became non-finite in a trial; only components that need no trial are selected" in reported
+    assert inputs.settings.components.points > 0.0
 
 
 def test_known_distances_are_a_log_likelihood_only_until_surfaces_have_emerged(capture, tmp_path, monkeypatch):

@@ -32,6 +32,7 @@ from nerfcli.training.runs.run import RunConfig
 from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.training.schedule import SEARCH_FRACTION, Budget
 from nerfcli.training.selection import Facts, select, with_evidence, with_known_cameras
+from nerfcli.training.step import NonFiniteError
 from nerfcli.training.storage import check_device_memory, needs_of, storage_for
 from nerfcli.training.trials import Trials
 
@@ -205,9 +206,7 @@ def _select(
     """Select components for the scene."""
     budget, requested = Budget.of(inputs.settings), inputs.settings.components
     if not budget.allows_trials:
-        notify("the budget is too short for trials; only components that need no trial are selected")
-        components, decisions = with_evidence(requested, facts)
-        return Selection(components, tuple(decisions))
+        return _without_trials(requested, facts, "the budget is too short for trials", notify=notify)
     requested, log_focal, measured = with_known_cameras(requested, facts)
     model, _ = with_evidence(requested, facts)
     uses_matched = facts.exposure_spread > 0.0 or requested.exposure == "matched"
@@ -221,10 +220,19 @@ def _select(
     )
     notify(f"selecting components, for up to {100 * SEARCH_FRACTION:.0f} % of the budget")
     used = time.perf_counter() - began - evidence.stereo_seconds
-    selection = select(trials, requested, facts, budget.of_search(used))
-    if not selection.decisions:
-        notify("the budget is too short for trials; using the default components")
+    try:
+        selection = select(trials, requested, facts, budget.of_search(used))
+        if not selection.decisions:
+            notify("the budget is too short for trials; using the default components")
+    except NonFiniteError:  # the training itself recovers from that
+        selection = _without_trials(requested, facts, "numbers became non-finite in a trial", notify=notify)
     return replace(selection, decisions=(*measured, *selection.decisions), log_focal=log_focal)
+
+
+def _without_trials(requested: Components, facts: Facts, why: str, *, notify: Callable[[str], None]) -> Selection:
+    notify(f"{why}; only components that need no trial are selected")
+    components, decisions = with_evidence(requested, facts)
+    return Selection(components, tuple(decisions))
 
 
 def _facts(photos: TrainingPhotos, settings: TrainSettings, evidence: Evidence) -> Facts:

@@ -48,7 +48,7 @@ UNWATCHED = Watch()
 
 
 class NonFiniteError(Exception):
-    """A step met a number that is not finite. `Sentinel` handles it; the user never sees it."""
+    """A step met a number that is not finite. `Sentinel` handles it, or the trials end; the user never sees it."""
 
 
 class State(Protocol):
