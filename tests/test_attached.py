@@ -16,7 +16,7 @@ from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.loading import load_scene
 from nerfcli.evaluate.photos import held_out_photos
-from nerfcli.matching.attached import FEWEST_PHOTOS, attached_masks
+from nerfcli.matching.attached import FEWEST_PHOTOS, attached_masks, masks_of
 from nerfcli.photos.images import read_image, write_png
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.poses.engine import turntable
@@ -38,6 +38,8 @@ GRIPPER = outline((250, 240), (262, 150), (285, 140), (300, 200), (300, 240))
 WATERMARK = outline((14, 200), (50, 196), (46, 226), (20, 230))
 BONNET = outline((0, 215), (160, 190), (320, 215), (320, 240), (0, 240))
 BARS = outline((0, 0), (320, 0), (320, 24), (0, 24)) | outline((0, 216), (320, 216), (320, 240), (0, 240))
+FRAME = ~outline((20, 20), (300, 20), (300, 220), (20, 220))
+ROUND = np.hypot(*np.mgrid[-119.5:120, -159.5:160]) > 115
 POLE = outline((296, 0), (304, 0), (304, 240), (296, 240))
 
 
@@ -67,7 +69,11 @@ def grown(mask: np.ndarray, by_px: int) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * by_px + 1, 2 * by_px + 1), np.uint8)) > 0
 
 
-@pytest.mark.parametrize("where", [GRIPPER, WATERMARK, BONNET, BARS], ids=["gripper", "watermark", "bonnet", "bars"])
+@pytest.mark.parametrize(
+    "where",
+    [GRIPPER, WATERMARK, BONNET, BARS, FRAME, ROUND],
+    ids=["gripper", "watermark", "bonnet", "bars", "frame", "round"],
+)
 def test_what_stays_in_place_is_found_with_its_edge(where):
     mask = mask_of(walls(where))
     assert mask is not None
@@ -169,17 +175,21 @@ def test_training_and_evaluation_leave_it_out(capture, tmp_path, fixed):
     assert held_out.used[~grown(GRIPPER, 8)].all()
 
 
+def job_of(work: Path, names: tuple[str, ...]) -> Job:
+    return Job(
+        folder=str(work), files=names, originals=str(work / "photos"), names=names, keys=names,
+        groups=(CameraGroup(tuple(range(len(names))), "PINHOLE", 320, 240),), pairs=(), neighbours=0,
+        max_image_size=320, max_features=500, seed=0, threads=1,
+    )  # fmt: skip
+
+
 def test_no_features_are_searched_for_on_it(tmp_path):
     """The masks of pycolmap are those of the next call, too; if one is lost, all are made again."""
     work, names = tmp_path / "scene" / "work", tuple(f"{number}.png" for number in range(len(STEPS)))
     (work / "photos").mkdir(parents=True)
     for name, one in zip(names, walls(GRIPPER), strict=True):
         Image.fromarray(one.pixels).save(work / "photos" / name)
-    job = Job(
-        folder=str(work), files=names, originals=str(work / "photos"), names=names, keys=names,
-        groups=(CameraGroup(tuple(range(len(names))), "PINHOLE", 320, 240),), pairs=(), neighbours=0,
-        max_image_size=320, max_features=500, seed=0, threads=1,
-    )  # fmt: skip
+    job = job_of(work, names)
     notes: list[str] = []
     masked, facts = mask_turning_object(job, notes.append)
     assert facts is None
@@ -192,3 +202,28 @@ def test_no_features_are_searched_for_on_it(tmp_path):
     assert recall_masks(job) == (masked, None)
     (work / "masks" / f"{names[3]}.png").unlink()
     assert recall_masks(job) is None
+
+
+def test_an_object_with_a_still_outline_is_not_taken_for_attached(tmp_path):
+    """Regression: a can on a turntable before a plain background, whose outline is the same in all photos."""
+    work, names = tmp_path / "scene" / "work", tuple(f"{number}.png" for number in range(12))
+    (work / "photos").mkdir(parents=True)
+    random = np.random.default_rng(0)
+    label = cv2.GaussianBlur(random.uniform(0, 255, (190, 1200)).astype(np.float32), (0, 0), 1.5)
+    angles = np.arcsin(np.linspace(-1.0, 1.0, 100))
+    for number, name in enumerate(names):
+        columns = ((angles / (2 * np.pi) + 0.02 * number) * 1200 % 1200).astype(int)
+        grey = random.normal(200, 2, (240, 320))
+        grey[25:215, 110:210] = np.clip(1.5 * (label[:, columns] - 128) + 90, 30, 150)
+        Image.fromarray(np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)).save(work / "photos" / name)
+    job = job_of(work, names)
+    assert mask_turning_object(job, lambda note: None) == (job, None)
+
+
+def test_held_out_photos_in_a_folder_of_their_own_have_the_masks_of_their_size():
+    photos = [replace(one, frame=replace(one.frame, name=f"train/{one.frame.name}")) for one in walls(GRIPPER)]
+    frames = [one.frame for one in photos]
+    other = replace(frames[0], name="test/0.png")
+    smaller = replace(other, name="test/1.png", camera=Camera.pinhole(300, 240, 300.0))
+    masks = masks_of([*frames, other, smaller], attached_masks(photos, threads=1), seen=frames)
+    assert set(masks) == {frame.name for frame in (*frames, other)}

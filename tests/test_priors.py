@@ -1,6 +1,7 @@
 """Priors besides colour: points of structure from motion, empty space behind masks, rays that are opaque or clear."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
@@ -223,8 +224,7 @@ def test_cameras_with_an_impossible_lens_are_named_and_not_called_exact(spheres,
     assert "these cameras are exact" in notes(spheres)
     told = notes(broken)
     assert "these cameras are exact" not in told
-    assert "% of the pixels are skipped" in told
-    assert "Its distortion must be wrong: estimate the cameras with nerfcli poses PHOTOS" in told
+    assert re.search(r"[6-9]\d % of all: the distortion of the lens must be wrong", told)
 
 
 def test_trials_that_become_non_finite_end_without_an_error(capture, tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ The world frame is that of its files: it is never rotated, moved or scaled here.
 
 import hashlib
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.captures.holdout import HELD_OUT_EVERY, default_split, names_held_out
 from nerfcli.captures.orientation import UPRIGHT, counted, rescaling, upright
 from nerfcli.errors import UserError, in_shell, several
-from nerfcli.photos.images import list_images
+from nerfcli.photos.images import list_photos
 from nerfcli.photos.masks import masks_inside
 
 
@@ -173,16 +174,20 @@ def describe_source(path: Path, scene: Capture) -> str:
     form, found = recognise(path)
     there = len(scene.frames)
     text = f"{found}: {form.name} ({form.of}), {there} of {there + len(scene.missing)} photos on disk"
-    without_pose = _without_pose(scene) if scene.kind.startswith("colmap") else []
+    folder, without_pose = _without_pose(scene) if scene.kind.startswith("colmap") else (found, [])
     if not without_pose:
         return text
+    subfolders = " --subfolders" if any(file.parent != folder for file in without_pose) else ""
     return (
         f"{text}; {several(len(without_pose), 'photo')} beside them, such as {without_pose[0].name}, without a pose: "
-        f"for poses of all, run nerfcli poses {in_shell(without_pose[0].parent)}"
+        f"for poses of all, run nerfcli poses {in_shell(folder)}{subfolders}"
     )
 
 
-def _without_pose(scene: Capture) -> list[Path]:
-    """Return the photos in the folders of a scene's photos that the scene does not have."""
+def _without_pose(scene: Capture) -> tuple[Path, list[Path]]:
+    """Return the folder of a scene's photos, with those of the photos in it that the scene does not have."""
     images = [frame.image for frame in scene.frames if frame.image is not None]
-    return sorted({file for folder in {image.parent for image in images} for file in list_images(folder)} - {*images})
+    folder = Path(os.path.commonpath([image.parent for image in images]))
+    there = list_photos(folder, subfolders=any(image.parent != folder for image in images)).pictures
+    masks = {name for image in images for name in (image.name, f"{image.stem}_mask")}
+    return folder, [file for file in there if file not in {*images} and file.stem not in masks]

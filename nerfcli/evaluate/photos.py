@@ -103,11 +103,12 @@ def as_exposed(photo: HeldOutPhoto, rgb: np.ndarray, opacity: np.ndarray) -> np.
     return shown.clamp(0.0, 1.0).numpy()
 
 
-def held_out_photos(run: Run, frames: Sequence[Frame]) -> list[HeldOutPhoto]:
+def held_out_photos(run: Run, frames: Sequence[Frame], *, left_out_by: Run | None = None) -> list[HeldOutPhoto]:
     """Load held-out photos of a run as for its training, each with its gains, from EXIF or from its neighbours.
 
     Args:
         frames: with their images and masks.
+        left_out_by: a run whose pixels that were left out do not count, instead of those of this run.
 
     Raises:
         UserError: a photo cannot be read.
@@ -117,7 +118,13 @@ def held_out_photos(run: Run, frames: Sequence[Frame]) -> list[HeldOutPhoto]:
     known = run.cameras.exposures
     exposed = zip(photos, log_gains_of(frames, known).tolist(), gain_sources(frames, known), strict=True)
     return [
-        HeldOutPhoto(photo.frame, photo.pixels, run.used_pixels(photo), log_gains=tuple(gains), gains_from=source)
+        HeldOutPhoto(
+            photo.frame,
+            photo.pixels,
+            (left_out_by or run).used_pixels(photo),
+            log_gains=tuple(gains),
+            gains_from=source,
+        )
         for photo, gains, source in exposed
     ]
 

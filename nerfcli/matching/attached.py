@@ -14,7 +14,7 @@ from pathlib import PurePosixPath
 
 import cv2
 import numpy as np
-from scipy.ndimage import binary_fill_holes
+from scipy.ndimage import distance_transform_edt
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import apply, inverse
@@ -23,12 +23,12 @@ from nerfcli.photos.loading import LoadedPhoto
 # Size at which photos are compared, and the smoothing of the pictures before their gradients are computed, pixels.
 LONGER_SIDE_PX, SMOOTHING_PX = 320, 1.0
 # With fewer photos, edges of the scene agree by chance; more than the second number tell nothing new.
-FEWEST_PHOTOS, MOST_PHOTOS = 6, 40
+FEWEST_PHOTOS, MOST_PHOTOS = 6, 24
 # The directions of an edge agree if their mean has this length. Gradients below the second number (levels per pixel)
 # count less than their direction: soft shades have one direction over a large area.
 LEAST_AGREEMENT, LEAST_GRADIENT = 0.9, 3.0
 # A static point at any distance moves by more than this across an edge of what is attached, pixels; so many pixels of
-# edges are examined at most.
+# edges are examined at most, and decide for those around them.
 LEAST_MOTION_PX, MOST_PIXELS = 1.5, 4000
 # Distances that are tried, in units of the RMS distance of the cameras from their mean; photos whose edges are
 # examined, and for each the photos nearest to it that a point is followed to.
@@ -41,8 +41,9 @@ GAP_PX, LEAST_PART, BORDER = 7, 0.002, 0.1
 MOST_SPREAD, REACH = 0.2, 0.08
 # What a part separates from the rest of the picture belongs to it up to this fraction of the picture.
 MOST_ENCLOSED = 0.25
-# If more than this fraction of the picture seems attached, it is the scene that does not move.
-MOST_OF_PICTURE = 0.5
+# If more than this fraction of the picture seems attached, it is the scene that does not move. A round picture leaves
+# 0.56 of one of 16:9.
+MOST_OF_PICTURE = 0.6
 
 Lens = tuple[PurePosixPath, tuple[int, int]]
 
@@ -71,6 +72,25 @@ def attached_masks(photos: Sequence[LoadedPhoto], *, threads: int) -> Mapping[Le
                 if mask is not None:
                     masks[lens] = enlarged(mask, lens[1])
     return masks
+
+
+def masks_of(
+    frames: Sequence[Frame], masks: Mapping[Lens, np.ndarray], *, seen: Sequence[Frame]
+) -> dict[str, np.ndarray]:
+    """Return the masks of frames by their names, those that have one.
+
+    Args:
+        masks: by the lens of the frames that were `seen`. Other frames have the masks of those in their folder, or of
+            the only ones of their size.
+    """
+    lenses = {lens_of(frame.name, frame.camera.size) for frame in seen}
+    found = {}
+    for frame in frames:
+        own = lens_of(frame.name, frame.camera.size)
+        alike = [lens for lens in lenses if lens == own or (own not in lenses and lens[1] == own[1])]
+        if len(alike) == 1 and alike[0] in masks:
+            found[frame.name] = masks[alike[0]]
+    return found
 
 
 def examined(count: int) -> list[int]:
@@ -109,9 +129,10 @@ def fixed_mask(
     if motions is not None and edges.any():
         rows, columns = (places[:: 1 + edges.sum() // MOST_PIXELS] for places in np.nonzero(edges))
         normals = directions[rows, columns] / agreement[rows, columns, None]
-        moves = motions(np.stack([columns, rows], axis=-1) + 0.5, normals, edges.shape)
-        edges = np.zeros_like(edges)
-        edges[rows, columns] = moves > LEAST_MOTION_PX
+        moves = np.full(edges.shape, np.nan)
+        moves[rows, columns] = motions(np.stack([columns, rows], axis=-1) + 0.5, normals, edges.shape)
+        nearest = distance_transform_edt(np.isnan(moves), return_distances=False, return_indices=True)
+        edges &= moves[tuple(np.asarray(nearest))] > LEAST_MOTION_PX
     mask = _parts_at_border(edges)
     if not mask.any():
         return None
@@ -176,8 +197,7 @@ def _parts_at_border(edges: np.ndarray) -> np.ndarray:
 
 
 def _with_enclosed(mask: np.ndarray) -> np.ndarray:
-    """Return a mask (h, w) with its holes, and with what it separates from the largest part of the picture."""
-    mask = np.asarray(binary_fill_holes(mask))
+    """Return a mask (h, w) with what it separates from the largest part of the picture."""
     count, labels, facts, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
     if count <= 1:
         return mask

@@ -229,7 +229,7 @@ def measure_waypoints(
                 held_out, factor=inputs.factor, threads=settings.threads, storage=inputs.storage, masks=masks
             )
             pool = PixelPool(
-                album.photos,
+                [photo.without(inputs.attached.get(photo.frame.name)) for photo in album.photos],
                 inputs.extent.training_from_scene,
                 torch.device(device),
                 colours=album.colours,

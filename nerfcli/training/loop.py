@@ -15,7 +15,7 @@ from nerfcli.errors import LOST_RANK, UserError
 from nerfcli.field.kinds import field_bytes, settings_from_json
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.machine import begin_recent_peak, peak_resident_bytes, use_threads
-from nerfcli.photos.masks import write_masks
+from nerfcli.photos.images import write_png
 from nerfcli.training.checkpoints import (
     Checkpoints,
     Totals,
@@ -26,7 +26,17 @@ from nerfcli.training.checkpoints import (
 )
 from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.preparation import prepare
-from nerfcli.training.runs.files import FIELD, LOG, METRICS, OCCLUDERS, STATE, LogEntry, append_log, cut_log
+from nerfcli.training.runs.files import (
+    FIELD,
+    LOG,
+    METRICS,
+    OCCLUDERS,
+    STATE,
+    LogEntry,
+    append_log,
+    cut_log,
+    left_out_mask,
+)
 from nerfcli.training.runs.run import RunConfig, continued, write_config
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import WAYPOINTS, Budget
@@ -49,9 +59,11 @@ def write_left_out(run: Path, inputs: TrainingInputs, *, notify: Callable[[str],
     folder, hidden = run / OCCLUDERS, {}
     if inputs.occluders is not None:
         hidden = {frame.name: mask for frame, mask in zip(inputs.pool.frames, inputs.occluders, strict=True)}
-    both = {name: mask | hidden.get(name, mask) for name, mask in inputs.attached.items()}
     shutil.rmtree(folder, ignore_errors=True)
-    write_masks(folder, {name: ~mask for name, mask in (hidden | both).items() if mask.any()})
+    for name in dict.fromkeys([*hidden, *inputs.attached]):
+        mask = np.logical_or.reduce([masks[name] for masks in (hidden, inputs.attached) if name in masks])
+        if mask.any():
+            write_png(left_out_mask(run, name), np.where(mask, 0, 255).astype(np.uint8))
     left_out = {name: 100.0 * float(mask.mean()) for name, mask in hidden.items()}
     most = sorted((name for name in left_out if left_out[name]), key=lambda name: -left_out[name])
     if most:

@@ -17,7 +17,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.loading import refuse_without_training_photos
 from nerfcli.errors import UserError, several
 from nerfcli.machine import default_memory_limit
-from nerfcli.matching.attached import attached_masks, lens_of
+from nerfcli.matching.attached import attached_masks, masks_of
 from nerfcli.matching.correspondences import SharedFeatures
 from nerfcli.matching.plain_background import plain_background
 from nerfcli.matching.tracks import triangulate
@@ -82,7 +82,7 @@ def prepare(
     album = load_album(scene.train_frames, factor=factor, threads=threads, storage=storage, masks=masks)
     photos = _photos(scene, album, threads)
     photos = replace(photos, plain=_plain_background(photos, settings, None if begun is None else begun.extent))
-    attached = _attached(photos, settings, factor, notify=notify)
+    attached = distributed.from_first(lambda: _attached(photos, settings, factor, notify=notify))
     if attached:
         seen = tuple(photo.without(attached.get(photo.frame.name)) for photo in album.photos)
         photos = _photos(scene, replace(album, photos=seen), threads)
@@ -108,7 +108,7 @@ def prepare(
         seconds["trials"] = selection.seconds - sum(seconds.values())
         settings, log_focal = replace(settings, components=selection.components), selection.log_focal
     elif is_new and settings.model != "auto" and settings.components.cameras in LEARN_FOCAL:
-        _, log_focal, decisions = with_known_cameras(settings.components, _facts(photos, settings, evidence))
+        _, log_focal, decisions = with_known_cameras(settings.components, _facts(photos, inputs, evidence))
         for decision in decisions:
             notify(decision.in_words())
 
@@ -135,23 +135,23 @@ def _attached(
 ) -> dict[str, np.ndarray]:
     """Return the masks of what is attached to the cameras, by the names of photos; report how much that is.
 
-    Held-out photos have those of the training photos of their camera. Before a plain background, nothing else tells
-    what moves with the camera.
+    Before a plain background, nothing else tells what moves with the camera.
     """
     if not settings.may_have_occluders or photos.plain is not None:
         return {}
     masks = attached_masks(photos.album.photos, threads=settings.threads)
-    scene, found = photos.scene, {}
-    for frame in (*scene.train_frames, *scene.test_frames):
-        mask = masks.get(lens_of(frame.name, downscaled_camera(frame.camera, factor).size))
-        if mask is not None:
-            found[frame.name] = mask
-    if found:
-        fraction = np.mean([mask.mean() for mask in found.values()])
-        notify(
-            f"attached to the camera: {100.0 * fraction:.1f} % of the pixels of {several(len(found), 'photo')} stay in "
-            "place while it moves, and are left out"
-        )
+    frames = [
+        replace(frame, camera=downscaled_camera(frame.camera, factor))
+        for frame in (*photos.scene.train_frames, *photos.scene.test_frames)
+    ]
+    found = masks_of(frames, masks, seen=[photo.frame for photo in photos.album.photos])
+    if not found:
+        return found
+    fraction = np.mean([mask.mean() for mask in found.values()])
+    notify(
+        f"attached to the camera: {100.0 * fraction:.1f} % of the pixels of {several(len(found), 'photo')} stay in "
+        "place while it moves, and are left out"
+    )
     return found
 
 
@@ -194,7 +194,7 @@ def _decide(
     evidence = collect_evidence(photos, inputs.pool, settings=settings, is_new=is_new, notify=notify)
     if not is_new or settings.model != "auto":
         return evidence, None
-    selection = _select(inputs, evidence, _facts(photos, settings, evidence), began=began, notify=notify)
+    selection = _select(inputs, evidence, _facts(photos, inputs, evidence), began=began, notify=notify)
     for decision in selection.decisions:
         notify(decision.in_words())
     return evidence, replace(selection, seconds=time.perf_counter() - began)
@@ -235,8 +235,9 @@ def _without_trials(requested: Components, facts: Facts, why: str, *, notify: Ca
     return Selection(components, tuple(decisions))
 
 
-def _facts(photos: TrainingPhotos, settings: TrainSettings, evidence: Evidence) -> Facts:
+def _facts(photos: TrainingPhotos, inputs: TrainingInputs, evidence: Evidence) -> Facts:
     """Return what the selection needs to know about the scene."""
+    settings = inputs.settings
     exif, depths = photos.log_exposures, (evidence.track_depths, evidence.stereo_depths, evidence.sensor_depths)
     points, stereo, sensor = (0 if one is None else len(one.numbers) for one in depths)
     return Facts(
@@ -253,6 +254,7 @@ def _facts(photos: TrainingPhotos, settings: TrainSettings, evidence: Evidence) 
         sky_confirmed=evidence.sky_confirmed,
         is_plain=photos.plain is not None,
         occluded_fraction=evidence.occluded_fraction,
+        has_attached=bool(inputs.attached),
         photos=len(exif),
         exposure_spread=evidence.exposure_spread,
         fixed=settings.fixed,
@@ -262,10 +264,13 @@ def _facts(photos: TrainingPhotos, settings: TrainSettings, evidence: Evidence) 
 def _without_ray(pool: PixelPool) -> str:
     """Say that pixels have no ray, and what that means if they are most of them."""
     fraction = pool.without_ray / len(pool.colours)
-    note = f"{100.0 * fraction:.2g} % of the pixels are skipped: they lie outside the lens model's field of view"
+    note = f"{pool.without_ray} pixels are skipped: they lie outside the lens model's field of view"
     if fraction <= MOST_WITHOUT_RAY:
         return note
-    return f"{note}. Its distortion must be wrong: estimate the cameras with nerfcli poses PHOTOS"
+    return (
+        f"{note}. These are {100.0 * fraction:.0f} % of all: the distortion of the lens must be wrong; nerfcli poses "
+        "PHOTOS estimates it"
+    )
 
 
 def _known(scene: Capture) -> str | None:

@@ -54,6 +54,7 @@ class Facts:
         sky_confirmed: whether 3D points confirm that it is one.
         is_plain: whether it is a plain background around an object.
         occluded_fraction: fraction of the pixels where something hides a surface that other photos see.
+        has_attached: whether something is attached to a camera, see `matching.attached`.
         photos: number of training photos.
         exposure_spread: standard deviation of the photos' brightness at points that they share, in logarithms of light.
         fixed: names of the components that the user has set.
@@ -71,6 +72,7 @@ class Facts:
     sky_confirmed: bool = False
     is_plain: bool = False
     occluded_fraction: float = 0.0
+    has_attached: bool = False
     photos: int = 0
     exposure_spread: float = 0.0
     fixed: tuple[str, ...] = ()
@@ -127,12 +129,14 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
         wanted.append((("points", CHOICES["points"].on), f"{facts.points:,} pixels see a 3D point at a known distance"))
         if facts.stereo:
             wanted.append((("stereo", True), f"several photos agree on the depth of {facts.stereo:,} pixels"))
-        if facts.occluded_fraction:
-            reason = f"{100.0 * facts.occluded_fraction:.1f} % of the pixels hide surfaces that other photos see"
-            wanted.append((("occluders", True), reason))
         if facts.exposure_spread > LIKELY_EXPOSURE_SPREAD:
             reason = f"photos differ by {_stops(facts.exposure_spread)} at the same points"
             wanted.append((("exposure", "matched" if facts.photos <= FEW_PHOTOS else "learned"), reason))
+    hiding = ["something is attached to the camera"] if facts.has_attached else []
+    if facts.occluded_fraction and facts.points and may_use:
+        hiding.append(f"{100.0 * facts.occluded_fraction:.1f} % of the pixels hide surfaces that other photos see")
+    if hiding:
+        wanted.append((("occluders", True), "; ".join(hiding)))
     if facts.sensor:
         wanted.append((("sensor", True), f"a sensor has measured the depth of {facts.sensor:,} pixels"))
     if facts.sky_confirmed or facts.is_plain:

@@ -28,6 +28,7 @@ from nerfcli.notices import Reporter
 from nerfcli.output import Output
 from nerfcli.photos.exif import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.photos.images import read_image
+from nerfcli.photos.loading import is_transparent
 from nerfcli.training.runs.components import CHOICES
 from nerfcli.training.runs.files import STATE
 from nerfcli.training.runs.run import Run
@@ -84,14 +85,15 @@ def ablate_scene(
         (target / STATE).unlink(missing_ok=True)
         return run
 
+    judge: Run | None = None
     measured: list[MeasuredTraining] = []
     compared: list[Variant] = []
     rows: list[ResultRow] = []
     if settings.model == "auto":
         reporter.progress(0.0, "selecting components for this scene")
-        run = trained(AUTO, settings)
+        run = judge = trained(AUTO, settings)
         compared.append(Variant(AUTO, settings.components))
-        measured.append(_measured(run, AUTO, settings))
+        measured.append(_measured(run, AUTO, settings, judge=judge))
         settings = replace(settings, model="default", components=run.components, fixed=())
         about["chosen"] = asdict(settings.components)
         reporter.note(_line(measured[-1]))
@@ -102,7 +104,9 @@ def ablate_scene(
     for number, (seed, variant) in enumerate(todo):
         reporter.progress(number / len(todo), f"{variant.name}, seed {seed} ({number + 1} of {len(todo)})")
         wanted = replace(settings, components=variant.components, seed=seed)
-        measured.append(_measured(trained(variant.name, wanted), variant.name, wanted))
+        run = trained(variant.name, wanted)
+        judge = judge or run
+        measured.append(_measured(run, variant.name, wanted, judge=judge))
         reporter.note(_line(measured[-1]))
         about["complete"] = number + 1 == len(todo)
         rows = rows_of(measured, compared)
@@ -116,16 +120,20 @@ def _capture(scene: Capture) -> CaptureTraits:
     seen = parse_colmap(sparse).observations if sparse is not None else None
     exif = log_exposures(scene.train_frames)
     return CaptureTraits(
-        has_alpha=first is not None and read_image(first).shape[-1] == 4,
+        has_alpha=first is not None and is_transparent(read_image(first)),
         has_points=seen is not None and len(seen.pixels) > 0,
         has_exif=bool(np.ptp(relative_log_exposures(exif, mean_log_exposure(exif))) > 0.0),
     )
 
 
-def _measured(run: Run, name: str, settings: TrainSettings) -> MeasuredTraining:
-    """Return a training measured on random pixels of the held-out photos, the same for all variants of a seed."""
+def _measured(run: Run, name: str, settings: TrainSettings, *, judge: Run) -> MeasuredTraining:
+    """Return a training measured on random pixels of the held-out photos, the same for all variants of a seed.
+
+    Args:
+        judge: the run that is measured first. The pixels that it left out do not count, whatever others left out.
+    """
     model, last = run.model(settings.device), run.log[-1]
-    photos = held_out_photos(run, run.cameras.test)
+    photos = held_out_photos(run, run.cameras.test, left_out_by=judge)
     sample = SampledPixels.drawn(photos, seed=settings.seed)
     return MeasuredTraining(
         name, settings.seed, sample.psnr(model), last["seconds"], last["step"], f"{sample.protocol()}{_SAME}"

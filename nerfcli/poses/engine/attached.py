@@ -1,59 +1,76 @@
 """Masks of what is attached to the camera, for the search for features: its own would hold all photos at one place."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+import shutil
+from collections.abc import Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import astuple, replace
+from typing import Any
 
 import numpy as np
 
-from nerfcli.errors import UserError, several
+from nerfcli.errors import several
 from nerfcli.matching.attached import Lens, enlarged, examined, fixed_mask, lens_of, reduced
 from nerfcli.photos.images import image_size, read_image
-from nerfcli.poses.input.job import Job, Tell
+from nerfcli.poses.input.job import Job, Tell, WorkMask
 from nerfcli.poses.input.layout import write_mask, write_no_mask
 
+# A mask is not used if more than this fraction of the matches that move lie in it: it would be of the object.
+MOST_MOVING = 0.02
 
-def mask_attached(job: Job, pictures: Mapping[int, np.ndarray], tell: Tell) -> Job | None:
-    """Return the job with masks of what has the same place in the photos of a camera; None if nothing has.
+
+def mask_attached(
+    job: Job, numbers: Collection[int], moving: Sequence[tuple[int, np.ndarray]], tell: Tell
+) -> Sequence[WorkMask]:
+    """Write masks of what has the same place in the photos of a camera, and return them; none if nothing has.
 
     They are for the search for features alone: without poses, an edge along which the scene moves looks the same, such
     as a rail before a train. Training finds what is attached again, with the poses.
 
     Args:
-        pictures: reduced pictures (h, w, 3) of some of the photos, by number; these decide.
+        numbers: of the photos that decide.
+        moving: photos by number with places (N, 2) in them of matches that move, as fractions of the photo's size.
     """
     sizes = [image_size(job.photos / file) for file in job.files]
     lenses = [lens_of(name, size) for name, size in zip(job.names, sizes, strict=True)]
     groups: dict[Lens, list[int]] = {}
-    for number in sorted(pictures):
+    for number in sorted(numbers):
         groups.setdefault(lenses[number], []).append(number)
     masks: dict[Lens, np.ndarray] = {}
-    for lens, group in groups.items():
-        chosen = [reduced(pictures[group[index]]) for index in examined(len(group))]
-        mask = fixed_mask(np.stack(chosen)) if chosen else None
-        if mask is not None:
-            masks[lens] = ~enlarged(mask, lens[1])
+    with ThreadPoolExecutor(job.threads) as pool:
+        for lens, group in groups.items():
+            files = [job.photos / job.files[group[index]] for index in examined(len(group))]
+            small = list(pool.map(lambda file: reduced(read_image(file)[..., :3]), files))
+            mask = fixed_mask(np.stack(small)) if small else None
+            if mask is None:
+                continue
+            places = np.concatenate([np.zeros((0, 2)), *(found for number, found in moving if lenses[number] == lens)])
+            columns, rows = (places * mask.shape[::-1]).astype(int).clip(0, np.array(mask.shape[::-1]) - 1).T
+            if mask[rows, columns].sum() < MOST_MOVING * len(places):
+                masks[lens] = enlarged(mask, lens[1])
     if not masks:
-        return None
-    fraction = 100.0 * np.mean([1.0 - mask.mean() for mask in masks.values()])
+        return ()
+    fraction = 100.0 * np.mean([mask.mean() for mask in masks.values()])
     masked = several(sum(lens in masks for lens in lenses), "photo")
     tell(f"attached to the camera: {fraction:.1f} % of the pixels of {masked}, where no features are searched for")
     job.mask_folder.mkdir(exist_ok=True)
-    return replace(
-        job,
-        masks=tuple(
-            write_mask(job.mask_folder / f"{file}.png", masks[lens])
-            if lens in masks
-            else write_no_mask(job.mask_folder / f"{file}.png", lens[1])
-            for file, lens in zip(job.files, lenses, strict=True)
-        ),
-    )
+    first: dict[Lens, tuple[str, WorkMask]] = {}
+    for file, lens in zip(job.files, lenses, strict=True):
+        path = job.mask_folder / f"{file}.png"
+        if lens in first:
+            shutil.copyfile(job.mask_folder / f"{first[lens][0]}.png", path)
+        else:
+            mask = write_mask(path, ~masks[lens]) if lens in masks else write_no_mask(path, lens[1])
+            first[lens] = file, mask
+    return [first[lens][1] for lens in lenses]
 
 
-def recall_attached(job: Job) -> Job | None:
-    """Return the job with the masks that `mask_attached` wrote for it; None if one is missing or damaged."""
-    try:
-        masks = [read_image(job.mask_folder / f"{file}.png")[..., 0] > 0 for file in job.files]
-    except UserError:
+def remembered(masks: Sequence[WorkMask]) -> list[Any]:
+    """Return masks as `recalled` takes them."""
+    return [astuple(mask) for mask in masks]
+
+
+def recalled(job: Job, masks: Sequence[Any]) -> Job | None:
+    """Return the job with the masks that `mask_attached` wrote for it; None if one of their files is missing."""
+    if not all((job.mask_folder / f"{file}.png").is_file() for file in job.files):
         return None
-    laid_out = [write_mask(job.mask_folder / f"{file}.png", mask) for file, mask in zip(job.files, masks, strict=True)]
-    return replace(job, masks=tuple(laid_out))
+    return replace(job, masks=tuple(WorkMask(*mask) for mask in masks))

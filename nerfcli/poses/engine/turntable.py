@@ -23,7 +23,7 @@ from nerfcli.matching.features import LOOSE_RATIO, Features, find_features, mutu
 from nerfcli.matching.stationary import Motions, Stationary, in_place, motions, together
 from nerfcli.photos.images import image_size, read_image
 from nerfcli.photos.masks import read_mask
-from nerfcli.poses.engine.attached import mask_attached, recall_attached
+from nerfcli.poses.engine.attached import mask_attached, recalled, remembered
 from nerfcli.poses.engine.features import feature_keys
 from nerfcli.poses.input import still_background as still
 from nerfcli.poses.input.job import Job, Tell, WorkMask, file_key, read_stage, stage_key, write_stage
@@ -44,7 +44,7 @@ _WHITE = (0.003, 0.9)
 _VERSION = "two motions, displaced backgrounds, attached things"
 _STAGE = "turntable.json"
 # Hashes of each photo and of its mask as written, by the photo's name, so that masks that were edited since are kept.
-_WRITTEN = "turntable-masks.json"
+_WRITTEN, _WRITTEN_VERSION = "turntable-masks.json", "two motions, displaced backgrounds"
 MASKS = "masks"
 
 
@@ -82,10 +82,6 @@ class _Photos:
         with ThreadPoolExecutor(self._job.threads) as pool:
             self._read.update(zip(missing, pool.map(self._photo, missing), strict=True))
 
-    def pictures(self, numbers: Collection[int]) -> dict[int, np.ndarray]:
-        """Return the reduced pictures of those of the photos that have been read."""
-        return {number: photo.picture for number, photo in self._read.items() if number in numbers}
-
     def _photo(self, number: int) -> _Photo:
         pixels = np.ascontiguousarray(read_image(self._job.photos / self._job.files[number])[..., :3])
         grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
@@ -117,7 +113,7 @@ def recall_masks(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
     if content is None:
         return None
     if content.get("attached"):
-        masked = recall_attached(job)
+        masked = recalled(job, content["attached"])
         return None if masked is None else (masked, content if "found" in content else None)
     if not content or not content["masked"]:
         return job, content or None
@@ -148,11 +144,15 @@ def mask_turning_object(job: Job, tell: Tell) -> tuple[Job, dict[str, Any] | Non
     training = [number for number in range(len(job.files)) if number not in job.held_out]
     compared = _compare_photos(photos, training)
     motions = _together(compared)
-    attached = None if motions.found else mask_attached(job, photos.pictures(training), tell)
-    facts: dict[str, Any] = {} if attached is None else {"attached": True}
+    facts: dict[str, Any] = {}
+    if not motions.found:
+        moving = [(pair.first, pair.places[pair.motions.moves]) for pair in compared]
+        if attached := mask_attached(job, training, moving, tell):
+            facts["attached"] = remembered(attached)
+            job = replace(job, masks=tuple(attached))
     if not motions.two_motions:
         write_stage(Path(job.folder) / _STAGE, _key(job), facts)
-        return attached or job, None
+        return job, None
     facts |= {
         "pairs": motions.two + motions.still + motions.moved,
         "pairs_two_motions": motions.two,
@@ -175,7 +175,7 @@ def mask_turning_object(job: Job, tell: Tell) -> tuple[Job, dict[str, Any] | Non
     if facts["masked"]:
         job = replace(job, masks=_write_masks(job, masks, edited))
     write_stage(Path(job.folder) / _STAGE, _key(job), facts)
-    return attached or job, facts
+    return job, facts
 
 
 def describe_motions(facts: dict[str, Any]) -> str:
@@ -328,7 +328,7 @@ def _edited_masks(job: Job, tell: Tell) -> set[str]:
 
     Those of photos that got none are the user's too. Those that cannot be read or do not fit are renamed.
     """
-    written, edited = read_stage(Path(job.folder) / _WRITTEN, _VERSION) or {}, set[str]()
+    written, edited = read_stage(Path(job.folder) / _WRITTEN, _WRITTEN_VERSION) or {}, set[str]()
     for name, key in zip(job.names, job.keys, strict=True):
         path = scene_masks(job) / f"{name}.png"
         photo_key, mask_key = written.get(name, (key, "") if written else ("", ""))
@@ -349,8 +349,8 @@ def _write_masks(job: Job, masks: Sequence[np.ndarray | None], edited: Collectio
     stage = Path(job.folder) / _WRITTEN
     made = [name for name, mask in zip(job.names, masks, strict=True) if mask is not None and name not in edited]
     # If this call is interrupted, the next one must not take these masks for edited ones.
-    written = (read_stage(stage, _VERSION) or {}) | {name: ["", ""] for name in made}
-    write_stage(stage, _VERSION, written)
+    written = (read_stage(stage, _WRITTEN_VERSION) or {}) | {name: ["", ""] for name in made}
+    write_stage(stage, _WRITTEN_VERSION, written)
     laid_out = []
     for name, file, key, mask in zip(job.names, job.files, job.keys, masks, strict=True):
         size, target = image_size(job.photos / file), job.mask_folder / f"{file}.png"
@@ -369,7 +369,7 @@ def _write_masks(job: Job, masks: Sequence[np.ndarray | None], edited: Collectio
         Image.fromarray(mask).save(path)
         written[name] = [key, file_key(path)]
         laid_out.append(write_mask(target, mask))
-    write_stage(stage, _VERSION, written)
+    write_stage(stage, _WRITTEN_VERSION, written)
     return tuple(laid_out)
 
 

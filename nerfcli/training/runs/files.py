@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NotRequired, TypedDict, cast
 
 from nerfcli.atomic import atomic_path, cannot_write
@@ -21,6 +21,12 @@ PHOTO_DEPTHS = "photo_depths.npz"
 REPORT = "report.html"
 OCCLUDERS = "occluders"  # a folder of masks
 LOCK = ".train.lock"
+
+
+def left_out_mask(run: Path, photo: str) -> Path:
+    """Return the file of the pixels that a training left out of a photo, by its name; ".." in it is "up"."""
+    parts = ["up" if part == ".." else part for part in PurePosixPath(photo).parts]
+    return run.joinpath(OCCLUDERS, *parts[:-1], f"{parts[-1]}.png")
 
 
 class LogEntry(TypedDict):

@@ -23,7 +23,16 @@ from nerfcli.photos.images import read_image
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.model import Model, load_model
 from nerfcli.training.runs.components import Components, Decision, Selection, differences
-from nerfcli.training.runs.files import CONFIG, FIELD, METRICS, OCCLUDERS, STATE, LogEntry, TrainingSummary, read_log
+from nerfcli.training.runs.files import (
+    CONFIG,
+    FIELD,
+    METRICS,
+    STATE,
+    LogEntry,
+    TrainingSummary,
+    left_out_mask,
+    read_log,
+)
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.version import __version__
 
@@ -269,7 +278,7 @@ class Run:
 
         Not those of its mask, nor those that the training has left out of it.
         """
-        left_out = self.path / OCCLUDERS / f"{photo.frame.name}.png"
+        left_out = left_out_mask(self.path, photo.frame.name)
         if not left_out.exists():
             return photo.used
         kept = read_image(left_out)[..., 0] > 0
