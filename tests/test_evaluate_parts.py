@@ -95,12 +95,23 @@ def test_held_out_copies_of_training_photos_are_told():
     near = [looking("a", 1.0), looking("b", 2.0 + 1e-4), looking("c", 2.5)]
     (text,) = copy_warnings(novelty(near, training))
     assert text.startswith("2 of 3 held-out views have the pose of a training photo")
+    assert text.endswith("nerfcli train SCENE --holdout FILE --overwrite")
     turned = replace(near[1], world_from_cam=look_at(np.array([2.0, 0, -4]), np.array([2.1, 0, 9.0]), UP))
     assert copy_warnings(novelty([near[0], turned], training)) == []  # half of the views, as of a camera at rest
 
 
+def test_held_out_copies_are_told_if_the_training_photos_have_copies_too():
+    """As of every:8 of photos that are all in the capture twice, of brackets of exposures, of a camera at rest."""
+    training = [looking(f"{x}-{copy}", float(x)) for x in range(4) for copy in range(2)]
+    assert len(copy_warnings(novelty([looking("a", 1.0), looking("b", 2.0)], training))) == 1
+    assert len(copy_warnings(novelty([looking("a", 0.0)], training[:2]))) == 1
+    assert copy_warnings(novelty([looking("a", 1.5)], training)) == []
+
+
 def test_one_training_view_has_no_spacing():
-    assert novelty([looking("a", 1.0)], [looking("b", 0.0)])[0].spacings is None
+    (view,) = novelty([looking("a", 1.0)], [looking("b", 0.0)])
+    assert view.spacings is None
+    assert not view.is_training_view
 
 
 # Ledger

@@ -55,7 +55,8 @@ class Novelty:
     @property
     def is_training_view(self) -> bool:
         """True if a training photo has the same pose."""
-        return self.spacings is not None and self.spacings <= _SAME_SPACINGS and self.angle_deg <= _SAME_DEG
+        is_there = self.distance == 0 if self.spacings is None else self.spacings <= _SAME_SPACINGS
+        return is_there and self.angle_deg <= _SAME_DEG
 
 
 def novelty(held_out: Sequence[Frame], training: Sequence[Frame]) -> list[Novelty]:
@@ -321,7 +322,8 @@ def copy_warnings(views: Sequence[Novelty]) -> list[str]:
         return []
     return [
         f"{same} of {len(views)} held-out views have the pose of a training photo: the metrics show how well the field "
-        "remembers photos, not how good new views are. Hold out others: nerfcli train SCENE --holdout every:8"
+        "remembers photos, not how good new views are. Remove the copies, or list photos of other poses in a file: "
+        "nerfcli train SCENE --holdout FILE --overwrite"
     ]
 
 
