@@ -331,7 +331,9 @@ def test_a_matrix_of_intrinsics_is_read_like_its_numbers(tmp_path, key, value):
     assert third.camera.params == (90.0, 90.0, 31.0, 24.0)
 
 
-@pytest.mark.parametrize("value", [[], 0, {"fx": 40}, [40, 40, 32, 24], 1, np.full((3, 3), 2.0).tolist(), "K.txt"])
+@pytest.mark.parametrize(
+    "value", [[], 0, {"fx": 40}, [40, 40, 32, 24], 1, np.full((3, 3), 2.0).tolist(), [[10**400, 0, 0]] * 3, "K.txt"]
+)
 def test_what_is_no_matrix_of_intrinsics_changes_nothing(tmp_path, value):
     put_photos(tmp_path, "a.png", size=(64, 48))
     write_json(tmp_path / "transforms.json", {"fl_x": 90.0, "frames": [entry("a.png", intrinsics=value)]})

@@ -105,7 +105,7 @@ def _intrinsics_of(record: dict[str, Any]) -> dict[str, float]:
     for key in _MATRICES:
         try:
             values = np.array(record.get(key), dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):  # the last one: an integer with hundreds of digits
             continue
         values = values.reshape(3, 3) if values.shape == (9,) else values
         if values.shape not in ((3, 3), (3, 4), (4, 4)):
