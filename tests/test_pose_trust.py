@@ -881,7 +881,7 @@ def test_a_long_focal_length_that_the_photos_determine_is_accepted(tmp_path: Pat
 
 
 def test_many_photos_are_searched_again_for_as_many_features_as_few(solved: Solved, monkeypatch: pytest.MonkeyPatch):
-    job = replace(solved.job, max_features=2048)
+    job = replace(solved.job, max_features=2048, pairs=solved.job.pairs[:9])
     tried = attempts.MappingAttempts(job, lambda *progress: None, lambda note: None)
     searched: list[Job] = []
     monkeypatch.setattr(attempts, "extract", lambda job, report: searched.append(job))
