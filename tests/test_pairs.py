@@ -20,7 +20,7 @@ from nerfcli.poses.input.pairs import (
 )
 from nerfcli.poses.input.photos import Photo, Photos
 from nerfcli.poses.input.plan import Plan, TimeEstimate, make_plan
-from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.poses.input.settings import Search
 
 
 def named(*names: str) -> list[Photo]:
@@ -245,8 +245,7 @@ def test_pairs_with_few_common_features_are_left_out_where_both_photos_have_bett
 
 
 def plan_of(pairing: Pairing, *, photos: int = 100, threads: int = 1, features: int = 4096) -> Plan:
-    settings = PoseSettings(threads=threads, max_features=features)
-    return make_plan(Photos(Path("x"), tuple(lettered(photos)), {}), pairing, settings)
+    return make_plan(Photos(Path("x"), tuple(lettered(photos)), {}), pairing, Search(1600, features), threads=threads)
 
 
 def test_the_estimate_falls_with_threads_and_features():

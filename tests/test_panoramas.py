@@ -30,7 +30,7 @@ from nerfcli.photos.images import read_image
 from nerfcli.photos.loading import LoadedPhoto, load_photos
 from nerfcli.photos.panoramas import PANORAMA, is_panorama
 from nerfcli.poses.input.photos import find_photos
-from nerfcli.poses.input.settings import PoseSettings, for_panoramas
+from nerfcli.poses.input.settings import PoseSettings, Search, for_panoramas
 from nerfcli.poses.judge.acceptance import nothing_placed
 from nerfcli.poses.judge.parallax import panorama_rotation_fit
 from nerfcli.poses.model import held_out
@@ -334,7 +334,8 @@ def test_poses_of_panoramas_are_the_true_ones(scene):
 
 
 def test_features_of_panoramas_are_more_and_of_larger_pictures():
-    assert for_panoramas(FEW) == replace(FEW, max_image_size=3200, max_features=800)
+    assert for_panoramas(Search(1600, 400)) == Search(3200, 800)
+    assert for_panoramas(Search(1600, 2048, halved_from=4096)) == Search(3200, 4096, halved_from=8192)
 
 
 @pytest.mark.slow

@@ -408,7 +408,8 @@ def test_many_photos_need_fewer_features(tmp_path, photos, quality, features):
     for number in range(photos):
         Image.new("RGB", (8, 8), (number, 0, 0)).save(tmp_path / f"{number:03d}.png")
     prepared = plan_poses(tmp_path, settings=replace(ONE_THREAD, max_features=QUALITIES[quality][1]))
-    assert (prepared.settings.max_features, prepared.plan.max_features) == (features, features)
+    assert (prepared.search.max_features, prepared.plan.max_features) == (features, features)
+    assert prepared.search.halved_from == (4096 if features == 2048 else 0)
 
 
 def _wait_for_worker(scene: Path) -> None:

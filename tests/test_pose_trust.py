@@ -715,23 +715,25 @@ def test_first_attempts_and_those_of_many_photos_are_rough(
 
 
 @pytest.mark.parametrize(
-    ("placed", "size", "words"),
+    ("placed", "features", "halved_from", "size", "words"),
     [
         # A missing fraction of 0.9 is worth 4.5 times the first search, part of which goes to matching.
-        (1, 3634, "next: more features from photos of 3634 pixels (takes about 4.5 times as long"),
-        (7, 1871, "next: more features from photos of 1871 pixels (takes about 1.5 times as long"),
-        (8, None, "default thresholds"),
+        (1, 4096, 0, 3634, "next: more features from photos of 3634 pixels (takes about 4.5 times as long"),
+        (7, 4096, 0, 1871, "next: more features from photos of 1871 pixels (takes about 1.5 times as long"),
+        (7, 2048, 4096, 1871, "next: more features from photos of 1871 pixels (takes about 1.7 times as long"),
+        (7, 2048, 0, 1731, "next: more features from photos of 1731 pixels (takes about 1.5 times as long"),
+        (8, 4096, 0, None, "default thresholds"),
     ],
 )
 def test_the_search_of_larger_pictures_is_worth_what_is_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, placed: int, size: int | None, words: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, placed, features, halved_from, size, words
 ):
-    """Ten photos of 20 megapixels: by hand, the full size takes 8.7 times the first search."""
+    """Ten photos of 20 megapixels: by hand, the full size takes 8.7 times the first search for 4,096 features."""
     views = synthetic.ring(10, [WIDE], seed=0, turn_deg=200)
     synthetic.write_database(tmp_path / "database.db", views, synthetic.boulder(400, seed=0), noise=Noise(), seed=0)
     job = synthetic.synthetic_job(tmp_path, views, seed=0)
     groups = tuple(replace(group, width=5184, height=3888) for group in job.groups)
-    job = replace(job, groups=groups, max_image_size=1600, max_features=4096)
+    job = replace(job, groups=groups, max_image_size=1600, max_features=features, halved_from=halved_from)
     model = without(synthetic.true_model(views), range(placed + 1, 11), tear_down=False)
     searched: list[Job] = []
     notes: list[str] = []
@@ -880,19 +882,38 @@ def test_a_long_focal_length_that_the_photos_determine_is_accepted(tmp_path: Pat
     assert camera.mean_focal_length() == pytest.approx(3600.0, rel=0.02)
 
 
-def test_many_photos_are_searched_again_for_as_many_features_as_few(solved: Solved, monkeypatch: pytest.MonkeyPatch):
-    job = replace(solved.job, max_features=2048, pairs=solved.job.pairs[:9])
-    tried = attempts.MappingAttempts(job, lambda *progress: None, lambda note: None)
-    searched: list[Job] = []
-    monkeypatch.setattr(attempts, "extract", lambda job, report: searched.append(job))
-    monkeypatch.setattr(attempts, "start_matching", lambda *arguments: None)
-    monkeypatch.setattr(attempts, "map_from_other_starts", lambda tried: None)
-    monkeypatch.setattr(tried, "match", lambda *arguments: None)
-    monkeypatch.setattr(tried, "map", lambda *arguments: None)
-    for photos, features in ((150, 8192), (151, 4096)):
-        tried.job, tried.photos = job, photos
-        assert tried.may_search_again()
-        attempts.map_with_more_features(tried)
-        assert searched.pop().max_features == features
-    assert tried.job.pairs == job.pairs
-    assert not tried.may_search_again()
+@pytest.mark.parametrize(
+    ("photos", "features", "halved_from", "again"),
+    [
+        (150, 2048, 4096, 8192),
+        (151, 2048, 4096, 4096),
+        (151, 2048, 0, None),  # as was asked for
+        (151, 4096, 8192, 8192),  # panoramas
+        (151, 6144, 12288, None),  # no photo has that many
+    ],
+)
+def test_many_photos_are_searched_again_for_as_many_features_as_few(
+    solved: Solved, monkeypatch: pytest.MonkeyPatch, photos, features, halved_from, again
+):
+    """Photos of 20 megapixels with 5,000 features: many are not searched in larger pictures, nor all pairs matched."""
+    groups = tuple(replace(group, width=5184, height=3888) for group in solved.job.groups)
+    pairs = solved.job.pairs[:9]
+    job = replace(solved.job, groups=groups, pairs=pairs, max_image_size=1600)
+    job = replace(job, max_features=features, halved_from=halved_from)
+    notes: list[str] = []
+    tried = attempts.MappingAttempts(job, lambda *progress: None, notes.append)
+    tried.photos = photos
+    monkeypatch.setattr(attempts, "feature_counts", lambda job: [5000] * 10)
+    for name in ("extract", "start_matching", "map_from_other_starts"):
+        monkeypatch.setattr(attempts, name, lambda *arguments: None)
+    for name in ("match", "map"):
+        monkeypatch.setattr(tried, name, lambda *arguments: None)
+    assert tried.can_have_more_features() == (again is not None)
+    if again is None:
+        return
+    attempts.map_with_more_features(tried)
+    assert tried.job.max_features == again
+    assert (tried.job.max_image_size == job.max_image_size) == (tried.job.pairs == pairs) == (photos == 151)
+    if photos == 151:
+        assert notes[0].startswith(f"next: {again:,} features from each photo (takes about ")
+        assert not tried.can_have_more_features()

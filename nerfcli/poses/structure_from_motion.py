@@ -25,7 +25,7 @@ from nerfcli.poses.input.layout import find_masks, lay_out_masks, lay_out_photos
 from nerfcli.poses.input.pairs import Pairing, choose_pairs, read_pairs
 from nerfcli.poses.input.photos import Photos, find_photos
 from nerfcli.poses.input.plan import Plan, make_plan
-from nerfcli.poses.input.settings import PoseSettings, check_settings, for_many_photos, for_panoramas
+from nerfcli.poses.input.settings import PoseSettings, Search, check_settings, for_panoramas, search_for
 from nerfcli.poses.judge.checks import UNDERWAY
 from nerfcli.poses.model.cameras import PhotoGroups, group_by_given, group_photos
 from nerfcli.poses.report import PosesReport, closing_notes, make_report, refusal
@@ -105,15 +105,13 @@ def estimate_poses(
 
 @dataclass(frozen=True)
 class PreparedPhotos:
-    """What is known before the work: the photos, their cameras, the pairs to match, and the plan.
-
-    settings: those of the search for features, which are others for panoramas and for many photos.
-    """
+    """What is known before the work: the photos, their cameras, the pairs to match, the first search, and the plan."""
 
     photos: Photos
     grouped: PhotoGroups
     pairing: Pairing
     settings: PoseSettings
+    search: Search
     plan: Plan
 
     def notes(self) -> list[str]:
@@ -151,10 +149,11 @@ def plan_poses(
         pairing = choose_pairs(photos.photos, rule=settings.pairing)
     else:
         pairing = read_pairs(Path(settings.pairs_file), photos)
-    settings = for_many_photos(settings, len(photos.photos))
+    search = search_for(settings, len(photos.photos))
     if any(group.is_panorama for group in grouped.groups):
-        settings = for_panoramas(settings)
-    return PreparedPhotos(photos, grouped, pairing, settings, make_plan(photos, pairing, settings))
+        search = for_panoramas(search)
+    plan = make_plan(photos, pairing, search, threads=settings.cores)
+    return PreparedPhotos(photos, grouped, pairing, settings, search, plan)
 
 
 def _run(job: Job, work: Path, solve: Callable[..., None], notify: Tell) -> None:
@@ -188,8 +187,7 @@ def _lay_out(prepared: PreparedPhotos, work: Path, notify: Tell) -> Job:
         groups=prepared.grouped.groups,
         pairs=pairing.pairs,
         neighbours=pairing.neighbours,
-        max_image_size=settings.max_image_size,
-        max_features=settings.max_features,
+        **asdict(prepared.search),
         seed=settings.seed % 2**30,  # pycolmap's have 31 bits, and the numbers of attempts to map are added
         threads=settings.cores,
         masks=lay_out_masks(photos, files, masks, folder=work / "masks", notify=notify) if masks else (),

@@ -118,15 +118,12 @@ class MappingAttempts:
         )
 
     def can_have_more_features(self) -> bool:
-        """Return whether larger pictures or a higher limit would give any photo more features."""
-        job = self.job
+        """Return whether a higher limit, or larger pictures of not too many photos, would give any more features."""
+        job, are_many = self.job, self.photos > _MOST_FOR_ALL
+        most = job.halved_from if are_many else QUALITIES["best"][1]
+        limited = job.max_features < most and max(feature_counts(job), default=0) >= job.max_features
         larger = any(max(group.width, group.height) > job.max_image_size for group in job.groups)
-        limited = job.max_features < QUALITIES["best"][1] and max(feature_counts(job), default=0) >= job.max_features
-        return larger or limited
-
-    def may_search_again(self) -> bool:
-        """Return whether another search of all photos is worth its time: of many, if the first was for few features."""
-        return self.photos <= _MOST_FOR_ALL or self.job.max_features < QUALITIES["default"][1]
+        return limited or (larger and not are_many)
 
     def have_unmatched_pairs(self) -> bool:
         """Return whether some pairs of photos have not been compared."""
@@ -298,27 +295,35 @@ def map_with_all_pairs(attempts: MappingAttempts) -> None:
 
 
 def map_with_more_features(attempts: MappingAttempts) -> None:
-    """Search larger pictures for more features, within a time that grows with the fraction of missing photos."""
+    """Search larger pictures for more features; in many photos, only for as many features as fewer begin with."""
     job = attempts.job
-    longest = max(max(group.width, group.height) for group in job.groups)
-    usual = max(job.max_features, QUALITIES["default"][1])  # many photos begin with half of them
-    more = replace(job, variant="full-size", max_features=usual)
-    if attempts.photos <= _MOST_FOR_ALL:
-        more = replace(more, max_features=QUALITIES["best"][1], pairs=all_pairs(len(job.files)))
-    so_far = _search_seconds(replace(job, max_features=usual))
-    matching = matching_seconds(len(more.pairs), max_features=more.max_features)
-    full = _search_seconds(replace(more, max_image_size=FULL_SIZE)) - matching
-    allowed = _MOST_FOR_MORE * (1 - attempts.placed_fraction()) * so_far - matching
-    fraction = min(1.0, max(allowed, 0.0) / full) ** 0.5  # of the longer side: time is proportional to area
-    size = max(round(fraction * longest), job.max_image_size)
-    what = "more features from full-size photos" if fraction == 1 else f"more features from photos of {size} pixels"
-    attempts.job = more = replace(more, max_image_size=FULL_SIZE if fraction == 1 else size)
-    attempts.announce(what, takes=_search_seconds(more) / so_far)
+    without_halving = replace(job, max_features=job.halved_from or job.max_features, halved_from=0)
+    if attempts.photos > _MOST_FOR_ALL:
+        more = replace(without_halving, variant="full-size")
+        what = f"{more.max_features:,} features from each photo"
+    else:
+        seconds = _MOST_FOR_MORE * (1 - attempts.placed_fraction()) * _search_seconds(without_halving)
+        more = _with_larger_pictures(without_halving, seconds)
+        size = "full-size photos" if more.max_image_size == FULL_SIZE else f"photos of {more.max_image_size} pixels"
+        what = f"more features from {size}"
+    attempts.job = more
+    attempts.announce(what, takes=_search_seconds(more) / _search_seconds(job))
     extract(more, attempts.report)
     start_matching(more, more.pairs)
     attempts.match(more, more.pairs)
     attempts.map(what, MapperOptions())
     map_from_other_starts(attempts)
+
+
+def _with_larger_pictures(job: Job, seconds: float) -> Job:
+    """Return the job with all pairs, more features, and pictures as large as the CPU seconds allow."""
+    more = replace(job, variant="full-size", max_features=QUALITIES["best"][1], pairs=all_pairs(len(job.files)))
+    matching = matching_seconds(len(more.pairs), max_features=more.max_features)
+    full = _search_seconds(replace(more, max_image_size=FULL_SIZE)) - matching
+    fraction = min(1.0, max(seconds - matching, 0.0) / full) ** 0.5  # of the longer side: time is proportional to area
+    longest = max(max(group.width, group.height) for group in job.groups)
+    size = FULL_SIZE if fraction == 1 else max(round(fraction * longest), job.max_image_size)
+    return replace(more, max_image_size=size)
 
 
 # What follows the first attempt, in this order: each if its reason holds, and time is left.
@@ -328,10 +333,7 @@ FALLBACKS: tuple[tuple[Callable[[MappingAttempts], bool], Callable[[MappingAttem
     (MappingAttempts.may_have_a_fisheye, map_from_fisheye),
     (lambda a: a.connected_fraction() < _GOOD_FRACTION, map_from_other_starts),
     (lambda a: a.too_many_left_out() and a.photos <= _MOST_FOR_ALL and a.have_unmatched_pairs(), map_with_all_pairs),
-    (
-        lambda a: a.placed_fraction() < _FEW_FRACTION and a.can_have_more_features() and a.may_search_again(),
-        map_with_more_features,
-    ),
+    (lambda a: a.placed_fraction() < _FEW_FRACTION and a.can_have_more_features(), map_with_more_features),
 )
 
 

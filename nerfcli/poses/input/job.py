@@ -78,8 +78,8 @@ class Job:
     pairs. variant: "" or the name of an attempt with other features, which has its own database and stages:
     `replace(job, variant="full-size", max_image_size=...)`. masks: one per photo, or none at all for a capture without
     masks; their pictures are in mask_folder. held_out: photos that are placed last, with everything else fixed.
-    skipped_checks: (name, reason) of checks that ended an earlier process. threads: their number, never -1. The other
-    fields are as in `PoseSettings`.
+    skipped_checks: (name, reason) of checks that ended an earlier process. threads: their number, never -1.
+    max_image_size, max_features, halved_from: see `Search`. seed: as in `PoseSettings`.
     """
 
     folder: str
@@ -98,6 +98,7 @@ class Job:
     variant: str = ""
     held_out: tuple[int, ...] = ()
     skipped_checks: tuple[tuple[str, str], ...] = ()
+    halved_from: int = 0
 
     @property
     def photos(self) -> Path:

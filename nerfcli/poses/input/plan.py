@@ -12,7 +12,7 @@ from typing import NamedTuple
 from nerfcli.errors import duration
 from nerfcli.poses.input.pairs import Pairing, retrieval_feature_count
 from nerfcli.poses.input.photos import Photos
-from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.poses.input.settings import Search
 
 
 class Stage(NamedTuple):
@@ -76,17 +76,17 @@ class Plan:
         return f"{self.photos} photos, {self.pairs} pairs to match ({self.rule}), {about}: {times}; {memory}"
 
 
-def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings) -> Plan:
+def make_plan(photos: Photos, pairing: Pairing, search: Search, *, threads: int) -> Plan:
     """Return the plan for these photos."""
-    count, threads = len(photos.photos), settings.cores
+    count = len(photos.photos)
     all_pairs = math.comb(count, 2)
     pairs = min(len(pairing.pairs) + pairing.neighbours * count, all_pairs)
     sizes = [(photo.width, photo.height) for photo in photos.photos]
-    searched = _searched_pixels(sizes, max_image_size=settings.max_image_size)
-    features = min(settings.max_features, round(0.015 * sum(searched) / max(count, 1)))
+    searched = _searched_pixels(sizes, max_image_size=search.max_image_size)
+    features = min(search.max_features, round(0.015 * sum(searched) / max(count, 1)))
     look_alikes = all_pairs * 0.0003 * (retrieval_feature_count(count) / 256) ** 2
     seconds = {
-        "extract": extraction_seconds(sizes, max_image_size=settings.max_image_size) / threads,
+        "extract": extraction_seconds(sizes, max_image_size=search.max_image_size) / threads,
         "pair": look_alikes / threads if pairing.neighbours else 0.0,
         "match": matching_seconds(pairs, max_features=features) / threads,
         "map": mapping_seconds(count),
@@ -97,8 +97,8 @@ def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings) -> Plan:
     memory_bytes = 500e6 + count * 1.5e6 + threads * max(searched, default=0.0) * 70
     return Plan(
         photos=count,
-        max_image_size=settings.max_image_size,
-        max_features=settings.max_features,
+        max_image_size=search.max_image_size,
+        max_features=search.max_features,
         rule=pairing.rule,
         pairs=pairs,
         seconds={stage: round(value, 1) for stage, value in seconds.items() if value > 0},

@@ -1,6 +1,6 @@
 """Settings of structure from motion."""
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 from nerfcli.captures.holdout import DEFAULT_HOLDOUT
@@ -39,7 +39,7 @@ class PoseSettings:
     """Settings that the result depends on.
 
     max_image_size: longer side of the pictures that are searched for features, pixels. max_features: per photo. Both
-    are doubled for panoramas, see `for_panoramas`, and the default is halved for many photos, see `for_many_photos`.
+    are doubled for panoramas, see `for_panoramas`, and the default is halved for many photos, see `search_for`.
     threads: -1 for all; with 1 thread the same seed gives the same poses. camera_model: one of `CAMERA_MODELS`.
     min_registered: the fraction of photos that must be placed, 0...1. pairing: one of `PAIRINGS`; with pairs_file, a
     text file with two names per line, only these pairs are matched. masks: a folder of masks, see `photos.masks`.
@@ -69,16 +69,28 @@ class PoseSettings:
         return thread_count(max(self.threads, 0))
 
 
-def for_panoramas(settings: PoseSettings) -> PoseSettings:
-    """Return the settings for panoramas, which show about six times as much as a photo, at a smaller scale."""
-    return replace(settings, max_image_size=2 * settings.max_image_size, max_features=2 * settings.max_features)
+@dataclass(frozen=True)
+class Search:
+    """The search for features: the longer side of its pictures, pixels, and how many it is for in each photo.
+
+    halved_from: twice `max_features` if it is only half because there are many photos, else 0.
+    """
+
+    max_image_size: int
+    max_features: int
+    halved_from: int = 0
 
 
-def for_many_photos(settings: PoseSettings, count: int) -> PoseSettings:
-    """Return the settings for this many photos: the default number of features is halved for 100 or more."""
+def search_for(settings: PoseSettings, count: int) -> Search:
+    """Return the first search of this many photos: the default number of features is halved for 100 or more."""
     if count < _MANY_PHOTOS or settings.max_features != QUALITIES["default"][1]:
-        return settings
-    return replace(settings, max_features=_FEATURES_OF_MANY)
+        return Search(settings.max_image_size, settings.max_features)
+    return Search(settings.max_image_size, _FEATURES_OF_MANY, settings.max_features)
+
+
+def for_panoramas(search: Search) -> Search:
+    """Return the search of panoramas, which show about six times as much as a photo, at a smaller scale."""
+    return Search(*(2 * value for value in astuple(search)))
 
 
 def check_settings(settings: PoseSettings) -> None:
