@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from captures import CAMERAS, assert_same, photograph, put_photos, reprojection_px, ring, with_photos
+from scipy.spatial.transform import Rotation
 
 from nerfcli.atomic import write_json
 from nerfcli.cameras import rigid
@@ -303,11 +304,30 @@ def test_a_view_in_several_blender_files_is_used_once(tmp_path):
     assert parsed.notes == (f"listed in several files: {twice}; used as of the first of train, test and val",)
     other = {**content["frames"][0], "transform_matrix": content["frames"][1]["transform_matrix"]}
     write_json(tmp_path / "transforms_test.json", {**content, "frames": [other]})
-    with pytest.raises(UserError, match="is listed twice, with different poses"):
+    both = "transforms_train.json and transforms_test.json"
+    with pytest.raises(UserError, match=f"is listed with different poses in {both}"):
+        parse_blender(tmp_path)
+    other = {**content, "camera_angle_x": 1.01 * content["camera_angle_x"], "frames": content["frames"][:1]}
+    write_json(tmp_path / "transforms_test.json", other)
+    with pytest.raises(UserError, match=f"is listed with different fields of view in {both}"):
         parse_blender(tmp_path)
     write_json(tmp_path / "transforms_test.json", {**content, "frames": 2 * content["frames"][:1]})
     with pytest.raises(UserError, match="is listed twice"):
         parse_blender(tmp_path)
+
+
+def test_a_view_in_several_blender_files_may_be_rounded_to_six_digits(tmp_path):
+    """Its centre is thousands of units away."""
+    pose = np.array(OPENGL_POSE)
+    pose[:3, :3] = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix()
+    pose[:3, 3] = 1234.56789, -2345.67891, 3456.78912
+    rounded = [[float(f"{value:.6g}") for value in row] for row in pose]
+    put_photos(tmp_path, "a.png", size=(64, 48))
+    for split, angle, matrix in (("train", 0.6911112070083618, pose.tolist()), ("test", 0.691111, rounded)):
+        record = {"file_path": "a", "transform_matrix": matrix}
+        write_json(tmp_path / f"transforms_{split}.json", {"camera_angle_x": angle, "frames": [record]})
+    (frame,) = parse_blender(tmp_path).frames
+    assert frame.split == "train"
 
 
 MATRIX = np.array([[50.0, 0, 30.5], [0, 55.0, 24.5], [0, 0, 1]])

@@ -24,6 +24,8 @@ from nerfcli.errors import UserError, listed
 
 # Of the files that list a view, the first one's split counts: a view that is trained on cannot be held out.
 _PRIORITY = ("train", "test", "val")
+# A number with six significant digits differs by up to this fraction from the same one with more.
+_ROUNDING = 1e-5
 
 
 def parse_blender(folder: Path, given: UserInputs = UserInputs()) -> Capture:
@@ -54,12 +56,17 @@ def parse_blender(folder: Path, given: UserInputs = UserInputs()) -> Capture:
 
 
 def _used_once(frames: list[Frame], folder: Path) -> list[Frame]:
-    """Return the frames without those that a file of higher priority lists as well, which must have the same pose."""
+    """Return the frames without those that a file of higher priority lists as well, which must be the same views."""
     kept = dict[str, Frame]()
+    farthest = max(float(np.abs(frame.centre).max()) for frame in frames)
+    tolerance = _ROUNDING * np.array([1.0, 1.0, 1.0, farthest])  # of the columns of a pose
     for frame in sorted(frames, key=lambda frame: _PRIORITY.index(frame.split or "train")):
         first = kept.setdefault(frame.name, frame)
-        if not np.allclose(first.world_from_cam, frame.world_from_cam, rtol=0.0, atol=1e-6):
-            what = f"image {shown(frame.name)} is listed twice, with different poses"
+        moved = (np.abs(first.world_from_cam - frame.world_from_cam) > tolerance).any()
+        if moved or not math.isclose(_angle(first), _angle(frame), rel_tol=_ROUNDING):
+            off = "poses" if moved else "fields of view"
+            files = f"transforms_{first.split}.json and transforms_{frame.split}.json"
+            what = f"image {shown(frame.name)} is listed with different {off} in {files}"
             raise malformed(folder, what, "remove one of its two entries")
     return [frame for frame in frames if kept[frame.name] is frame]
 
