@@ -360,6 +360,38 @@ def test_what_is_no_matrix_of_intrinsics_changes_nothing(tmp_path, value):
     assert load_scene(tmp_path).frames[0].camera.params == (90.0, 90.0, 32.0, 24.0)
 
 
+@pytest.mark.parametrize(
+    ("place", "value", "more", "said"),
+    [
+        ((0, 1), 3.0, {}, "skew is 3, which no supported lens has, and the nearest one is off by 1"),
+        ((0, 1), 3.0, {"k1": 0.1}, "skew is 3, which no supported lens has"),
+        ((0, 1), 3.0, {"k1": 0.1, "camera_model": "OPENCV_FISHEYE"}, "skew is 3, which no supported lens has"),
+        ((0, 1), 3.0, {"k4": 0.1, "camera_model": "FULL_OPENCV"}, "skew is 3, which no lens with k4"),
+        ((1, 0), 3.0, {}, "K: is not a matrix of intrinsics"),
+        ((0, 0), math.nan, {}, "K: is not a matrix of intrinsics"),
+        ((0, 0), 0.5, {}, "K: fx is 0.5"),
+    ],
+)
+def test_what_a_matrix_of_intrinsics_cannot_hold_is_refused(tmp_path, place, value, more, said):
+    put_photos(tmp_path, "a.png", size=(64, 48))
+    matrix = MATRIX.copy()
+    matrix[place] = value
+    transforms_of(tmp_path, frames=[entry("a.png", K=matrix.tolist(), **more)])
+    with pytest.raises(UserError, match=said):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(("more", "model"), [({}, "PINHOLE"), ({"k1": 0.1}, "OPENCV")])
+def test_a_small_skew_in_a_matrix_of_intrinsics_is_fitted_and_said(tmp_path, more, model):
+    """The skew shifts the upper and lower edge of the picture by 0.1 * 24 / 55 px."""
+    put_photos(tmp_path, "a.png", size=(64, 48))
+    matrix = MATRIX.copy()
+    matrix[0, 1] = 0.1
+    write_json(tmp_path / "transforms.json", {"frames": [entry("a.png", K=matrix.tolist(), **more)]})
+    (note,) = load_scene(tmp_path).notes
+    assert note.startswith(f"skew of 1 camera, which {model} does not have: at most 0.04")
+
+
 def test_what_blender_cannot_hold_is_listed(tmp_path):
     cameras = (CAMERAS["OPENCV"], CAMERAS["PINHOLE"], Camera.pinhole(640, 480, 400.0))
     capture = replace(ring(*cameras, CAMERAS["OPENCV_FISHEYE"]), unit="metre")

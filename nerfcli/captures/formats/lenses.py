@@ -127,6 +127,21 @@ class Terms(NamedTuple):
         return ({"k4": k4} if k4 else {}) | self.beyond_fisheye
 
 
+def parts_of_matrix(matrix: np.ndarray, size: Size, where: str) -> tuple[Pair, Pair, float]:
+    """Return the focal lengths, principal point and skew of a matrix of intrinsics, see `Fits.matrix`.
+
+    A skew that counts as rounding is 0.
+
+    Raises:
+        UserError: the matrix is not of this form; `where` is named.
+    """
+    (fx, skew, cx), (lower, fy, cy), last = matrix.tolist()
+    if not np.isfinite(matrix).all() or lower != 0 or last != [0, 0, 1]:
+        raise malformed(where, "is not a matrix of intrinsics", "expected the rows fx 0 cx, 0 fy cy, 0 0 1")
+    matters = abs(skew) * size[1] > _NEGLIGIBLE_SKEW_PX * abs(fy)
+    return (fx, fy), (cx, cy), skew if matters else 0.0
+
+
 class Fits:
     """Makes the cameras of a capture, and remembers how far each approximated lens is off."""
 
@@ -163,11 +178,8 @@ class Fits:
         Raises:
             UserError: the matrix is not of this form, a number is invalid, or see `brown`; `where` is named.
         """
-        (fx, skew, cx), (lower, fy, cy), last = matrix.tolist()
-        if lower != 0 or last != [0, 0, 1]:
-            raise malformed(where, "is not a matrix of intrinsics", "expected the rows fx 0 cx, 0 fy cy, 0 0 1")
-        matters = not abs(skew) * size[1] <= _NEGLIGIBLE_SKEW_PX * abs(fy)
-        return self.brown(size, (fx, fy), (cx, cy), terms=Terms(skew=skew if matters else 0.0), where=where)
+        focal, centre, skew = parts_of_matrix(matrix, size, where)
+        return self.brown(size, focal, centre, terms=Terms(skew=skew), where=where)
 
     def notes(self) -> tuple[str, ...]:
         """Return what was fitted and how far it is off, for people."""

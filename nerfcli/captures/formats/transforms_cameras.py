@@ -12,15 +12,14 @@ import numpy as np
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.formats import fields, lenses
 from nerfcli.captures.formats.fields import malformed
-from nerfcli.captures.formats.lenses import Fits, Terms
+from nerfcli.captures.formats.lenses import Fits, Pair, Terms
 from nerfcli.captures.formats.limits import checked_camera
 from nerfcli.captures.formats.unsupported import distortion, projection
 from nerfcli.errors import several
 
 _INTRINSICS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-# Keys of a 3x3 matrix of intrinsics, and the keys of the numbers in it.
+# Keys of a 3x3 matrix of intrinsics.
 _MATRICES = ("K", "intrinsics", "intrinsic_matrix")
-_IN_MATRIX = {"fl_x": (0, 0), "fl_y": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 # Keys that give the same number; the first counts.
 _SAME = (("fl_x", "camera_angle_x"), ("fl_y", "camera_angle_y"))
 _FOCAL = {key for keys in _SAME for key in keys}
@@ -64,31 +63,25 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
     model = model.strip().upper() if isinstance(model, str) else model
     if model == "EQUIRECTANGULAR":
         return checked_camera(model, *size, size, where=where)
-    if not any(record.get(key) not in (None, "") for key in _FOCAL):
-        record = record | _intrinsics_of(record)
     foreign = next((key for key in _FOREIGN if record.get(key) not in (None, False)), None)
     if foreign is not None:
         raise malformed(where, f"the lens model of {foreign} is not supported", "undistort the pictures first")
-    focal = [_focal(record, "x", width, where), _focal(record, "y", height, where)]
-    known = [value for value in focal if value is not None]
-    if not known:
-        raise malformed(where, "neither fl_x nor camera_angle_x is given", "expected the focal length or field of view")
-    cx, cy = number(record, "cx", where), number(record, "cy", where)
-    # Blender's files give only the horizontal angle, since pixels are square.
-    head = (known[0], known[-1], width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+    focal, centre, skew = _without_distortion(record, size, where)
+    head = (*focal, *centre)
     k1, k2, k3, k4, k5, k6, p1, p2 = (number(record, key, where) or 0.0 for key in _INTRINSICS)
     if (k5 or k6) and model != _RATIONAL:
         raise malformed(where, f"k5 is {k5:g} and k6 is {k6:g}", f"only camera_model {_RATIONAL} has these terms")
     if model in _FISHEYE_MODELS or record.get("is_fisheye") is True:
-        radial, tangential = (k1, k2, k3, k4), (p1, p2)
-        return lenses.fisheye_camera(size, head[:2], head[2:], radial=radial, tangential=tangential, where=where)
+        return fits.fisheye(size, focal, centre, terms=Terms((k1, k2, k3, k4), (p1, p2), skew=skew), where=where)
     if model not in _PERSPECTIVE_MODELS:
         supported = ", ".join(str(name) for name in (*_PERSPECTIVE_MODELS[1:], *_FISHEYE_MODELS, "EQUIRECTANGULAR"))
         raise malformed(where, f"camera_model {model!r:.80} is not supported", f"expected one of {supported}")
     if model == _RATIONAL and (k4 or k5 or k6):
+        if skew:
+            raise malformed(where, f"skew is {skew:g}, which no lens with k4, k5 and k6 has", "undistort the photos")
         return checked_camera(model, width, height, (*head, k1, k2, p1, p2, k3, k4, k5, k6), where=where)
-    if k4:
-        return fits.brown(size, head[:2], head[2:], terms=Terms((k1, k2, k3, k4), (p1, p2)), where=where)
+    if k4 or skew:
+        return fits.brown(size, focal, centre, terms=Terms((k1, k2, k3, k4), (p1, p2), skew=skew), where=where)
     if k3:
         params = (*head, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
         return checked_camera("FULL_OPENCV", width, height, params, where=where)
@@ -97,10 +90,30 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
     return checked_camera("PINHOLE", width, height, head, where=where)
 
 
-def _intrinsics_of(record: dict[str, Any]) -> dict[str, float]:
-    """Return focal lengths and principal point from the first matrix of intrinsics among a frame's keys, if any.
+def _without_distortion(record: dict[str, Any], size: tuple[int, int], where: str) -> tuple[Pair, Pair, float]:
+    """Return the focal lengths and principal point of a frame, and the skew, which only a matrix of intrinsics has."""
+    width, height = size
+    matrix = None if any(record.get(key) not in (None, "") for key in _FOCAL) else _matrix_of(record)
+    if matrix is not None:
+        key, values = matrix
+        place = f"{where}.{key}"
+        focal, centre, skew = lenses.parts_of_matrix(values, size, place)
+        for name, value, size_px in zip(("fx", "fy"), focal, size, strict=True):
+            _check_focal(value, name, size_px, where=place)
+        return focal, centre, skew
+    found = [_focal(record, "x", width, where), _focal(record, "y", height, where)]
+    known = [value for value in found if value is not None]
+    if not known:
+        raise malformed(where, "neither fl_x nor camera_angle_x is given", "expected the focal length or field of view")
+    cx, cy = number(record, "cx", where), number(record, "cy", where)
+    # Blender's files give only the horizontal angle, since pixels are square.
+    return (known[0], known[-1]), (width / 2 if cx is None else cx, height / 2 if cy is None else cy), 0.0
 
-    It has 3x3 numbers, or more rows and columns that do not matter, stored row by row or column by column.
+
+def _matrix_of(record: dict[str, Any]) -> tuple[str, np.ndarray] | None:
+    """Return the key and the numbers (3, 3) of the first matrix of intrinsics among a frame's keys, if any.
+
+    The file has 3x3 numbers, or more rows and columns that do not matter, stored row by row or column by column.
     """
     for key in _MATRICES:
         try:
@@ -113,8 +126,8 @@ def _intrinsics_of(record: dict[str, Any]) -> dict[str, float]:
         values = values[:3, :3]
         for stored in (values, values.T):
             if (stored[2] == (0.0, 0.0, 1.0)).all():
-                return {name: float(stored[place]) for name, place in _IN_MATRIX.items()}
-    return {}
+                return key, stored
+    return None
 
 
 def merged(content: dict[str, Any], record: dict[str, Any]) -> dict[str, Any]:
@@ -123,7 +136,7 @@ def merged(content: dict[str, Any], record: dict[str, Any]) -> dict[str, Any]:
     Null and empty texts of a frame leave the value of the file.
     """
     own = {key: value for key, value in record.items() if value not in (None, "")}
-    has_own = bool(_FOCAL & own.keys() or _intrinsics_of(own))
+    has_own = bool(_FOCAL & own.keys()) or _matrix_of(own) is not None
     unused = _FOCAL | set(_MATRICES) if has_own else set[str]()
     return record | {key: value for key, value in content.items() if key not in unused} | own
 
@@ -188,9 +201,7 @@ def number(record: dict[str, Any], key: str, where: str) -> float | None:
 def _focal(record: dict[str, Any], axis: str, size_px: int, where: str) -> float | None:
     focal = number(record, f"fl_{axis}", where)
     if focal is not None:
-        if focal < _LEAST_FOCAL * size_px:
-            hint = f"expected a focal length in pixels, of pictures with {size_px} pixels there"
-            raise malformed(where, f"fl_{axis} is {focal}", hint)
+        _check_focal(focal, f"fl_{axis}", size_px, where=where)
         return focal
     angle = number(record, f"camera_angle_{axis}", where)
     if angle is None:
@@ -198,3 +209,9 @@ def _focal(record: dict[str, Any], axis: str, size_px: int, where: str) -> float
     if not 0 < angle < math.pi:
         raise malformed(where, f"camera_angle_{axis} is {angle}", "expected radians between 0 and pi")
     return size_px / 2 / math.tan(angle / 2)
+
+
+def _check_focal(focal: float, name: str, size_px: int, *, where: str) -> None:
+    if focal < _LEAST_FOCAL * size_px:
+        hint = f"expected a focal length in pixels, of pictures with {size_px} pixels there"
+        raise malformed(where, f"{name} is {focal}", hint)
