@@ -330,9 +330,11 @@ def test_closing_notes_name_components_and_checks(estimated: tuple[Path, PosesRe
         report,
         components=(first, {"size": 2, "photos": ["x.jpg", "y.jpg"], "apart": "no photo of it matches"}),
         not_computed={"pose uncertainty": "ValueError: singular"},
+        attempts=(*report.attempts, {"what": "only a part", "models": [4], "doubt": "two sides may look alike"}),
     )
     assert closing_notes(two) == [
         "2 photos (x.jpg ... y.jpg) form a model of their own: no photo of it matches; estimate their poses separately",
+        "two sides may look alike",
         "could not compute a check (pose uncertainty): ValueError: singular",
     ]
 

@@ -341,7 +341,7 @@ def test_a_way_is_skipped_that_takes_longer_than_what_is_left(
     assert "next: from the largest consistent part (about 30 s)" in notes
     assert "from scratch, with other initial pairs: skipped, since it takes about 2 min, and 70 s are left" in notes
     assert chosen.mapped.attempts[-1]["what"] == "only the largest consistent part of the first model"
-    assert notes[-1].startswith("photos of sides that look alike")
+    assert chosen.mapped.attempts[-1]["doubt"].startswith("photos of sides that look alike")
 
 
 def test_of_many_photos_a_few_are_not_worth_another_mapping_from_scratch(

@@ -303,7 +303,7 @@ def test_everything_that_was_warned_about_is_listed():
     poses = {
         "images": [{"name": "c.png", "registered": False, "reason": "too few matches"}, {"registered": True}],
         "verdict": {"failures": [{"kind": "implausible", "evidence": "the focal length is 9 times the width"}]},
-        "attempts": [{"what": "default thresholds"}, {"what": "full size"}],
+        "attempts": [{"what": "default thresholds"}, {"what": "full size", "doubt": "two sides may look alike"}],
         "pose_blur_px": {"largest": 3.21, "photo": "d.png"},
     }
     run = facts(
@@ -316,12 +316,13 @@ def test_everything_that_was_warned_about_is_listed():
             "c.png (too few matches)",
             "poses: implausible: the focal length is 9 times the width",
             "2 attempts",
+            "poses: two sides may look alike",
             "d.png is uncertain by 3.2 px",
         ),
         *("e.png", "intrinsics were halved", "non-finite 2 times", "nerfcli evaluate"),
     ):
         assert sum(part in text for text in reported) == 1, part
-    assert len(reported) == 8
+    assert len(reported) == 9
     assert list(warnings_of(facts())) == []
 
 

@@ -38,11 +38,11 @@ class PosesReport:
     verdict: whether the result is accepted, why not, and all measurements (see `acceptance`). pose_blur_px: median,
     largest, and the photo that has the largest. parts: sizes of the groups of photos connected by matches.
     seconds: per stage, for the call that wrote the report; time spent in earlier calls is not included. models: the
-    sizes of all models found, the kept one first. attempts: the result of each mapping attempt. matching: the rule
-    for pairs, their number, and hashes of the photos, masks and files that were used. points: number of points of the
-    kept model. intrinsics: the given intrinsics, see `cameras.PhotoGroups`. strict: how held-out photos were placed
-    afterwards, see `strict.place_held_out`. components: each model's photos and why it is not joined to the largest,
-    ordered by size.
+    sizes of all models found, the kept one first. attempts: the result of each mapping attempt, and the "doubt" that is
+    left about the last one, if any. matching: the rule for pairs, their number, and hashes of the photos, masks and
+    files that were used. points: number of points of the kept model. intrinsics: the given intrinsics, see
+    `cameras.PhotoGroups`. strict: how held-out photos were placed afterwards, see `strict.place_held_out`. components:
+    each model's photos and why it is not joined to the largest, ordered by size.
     not_computed: checks that could not be computed, and why.
     cut_short: what was stopped because it took far longer than planned.
     moving_foreground: facts about an object that turns in front of a static background, and its masks; see `turntable`.
@@ -148,6 +148,7 @@ def closing_notes(report: PosesReport) -> list[str]:
             "each photo has its own principal point, as with image stabilisation: error of held-out observations "
             f"{stabilised['shared_px']:.2f} -> {stabilised['own_px']:.2f} px"
         )
+    notes += [attempt["doubt"] for attempt in report.attempts if "doubt" in attempt]
     notes += [f"cut short: {what}" for what in report.cut_short]
     for check, why in report.not_computed.items():
         notes.append(f"could not compute a check ({check}): {why}")

@@ -136,6 +136,9 @@ def _of_poses(poses: dict[str, Any]) -> Iterator[tuple[str, str]]:
     attempts = poses.get("attempts", [])
     if len(attempts) > 1:
         yield "poses", f"mapping took {len(attempts)} attempts: {', '.join(str(one.get('what')) for one in attempts)}"
+    for attempt in attempts:
+        if "doubt" in attempt:
+            yield "poses", attempt["doubt"]
     blur = poses.get("pose_blur_px") or {}
     if (blur.get("largest") or 0.0) > 1.0:  # visible at the size of the photos
         yield "poses", f"the pose of {blur.get('photo')} is uncertain by {blur['largest']:.1f} px"

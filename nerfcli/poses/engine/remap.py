@@ -127,8 +127,8 @@ def remap_refused(given: ChosenModel, report: Report, tell: Tell) -> ChosenModel
         if found is None:
             continue
         if found.examined.verdict.accepted:
-            if what == ways[-1][0]:  # nothing that was mapped again agrees with it
-                tell(_MAY_LOOK_ALIKE)
+            if what == ways[-1][0]:  # the other ways were refused, or skipped, so that nothing confirms it
+                found.mapped.attempts[-1]["doubt"] = _MAY_LOOK_ALIKE
             return found
         by_global_mapper = found.mapped.models if what == _GLOBALLY else by_global_mapper
         given = replace(given, mapped=replace(mapped, attempts=found.mapped.attempts))
