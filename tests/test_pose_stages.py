@@ -33,7 +33,7 @@ from nerfcli.poses import structure_from_motion
 from nerfcli.poses import workspace as workspace_module
 from nerfcli.poses.engine.database import remove_database
 from nerfcli.poses.input.job import read_job, read_stage, write_stage
-from nerfcli.poses.input.settings import QUALITIES, PoseSettings
+from nerfcli.poses.input.settings import PoseSettings, Search
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.structure_from_motion import estimate_poses, plan_poses
 from nerfcli.poses.workspace import database_bytes, hash_inputs, is_same_scene, workspace
@@ -349,6 +349,18 @@ def test_a_scene_is_the_same_as_long_as_its_photos_and_masks_are(photos: Path, a
     assert is_same_scene(again, photos, settings)
 
 
+def test_a_scene_with_4096_features_by_default_in_an_earlier_version_is_the_same(photos: Path, again: Path):
+    """In a report of this version, they were asked for."""
+    path, by_default = again / "poses_report.json", replace(ONE_THREAD, max_features=None)
+    report = json.loads(path.read_text())
+    report["settings"]["max_features"] = 4096
+    path.write_text(json.dumps(report))
+    assert not is_same_scene(again, photos, by_default)
+    del report["search"]
+    path.write_text(json.dumps(report))
+    assert is_same_scene(again, photos, by_default)
+
+
 def test_the_worker_gets_numbers_that_libraries_take(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A pool of threads takes no -1, which stands for all of them, and pycolmap no seed beyond 31 bits."""
 
@@ -402,14 +414,20 @@ def test_planning_writes_nothing(photos: Path):
 
 
 @pytest.mark.parametrize(
-    ("photos", "quality", "features"), [(99, "default", 4096), (100, "default", 2048), (100, "best", 8192)]
+    ("photos", "asked", "search"),
+    [
+        (99, None, Search(192, 4096)),
+        (100, None, Search(192, 2048, halved_from=4096)),
+        (100, 4096, Search(192, 4096)),
+        (100, 8192, Search(192, 8192)),
+    ],
 )
-def test_many_photos_need_fewer_features(tmp_path, photos, quality, features):
+def test_many_photos_need_fewer_features_unless_more_are_asked_for(tmp_path, photos, asked, search):
     for number in range(photos):
         Image.new("RGB", (8, 8), (number, 0, 0)).save(tmp_path / f"{number:03d}.png")
-    prepared = plan_poses(tmp_path, settings=replace(ONE_THREAD, max_features=QUALITIES[quality][1]))
-    assert (prepared.search.max_features, prepared.plan.max_features) == (features, features)
-    assert prepared.search.halved_from == (4096 if features == 2048 else 0)
+    prepared = plan_poses(tmp_path, settings=replace(ONE_THREAD, max_features=asked))
+    assert prepared.search == search
+    assert prepared.plan.max_features == search.max_features
 
 
 def _wait_for_worker(scene: Path) -> None:

@@ -131,6 +131,7 @@ def test_the_report_file_has_the_promised_keys(solved: Solved):
     assert report["parts"] == [7]
     assert report["models"][0] == report["registered"] == 7
     assert report["settings"]["max_features"] == 500
+    assert report["search"] == {"max_image_size": 384, "max_features": 500}
     assert report["versions"]["pycolmap"] == pycolmap.__version__
     assert report["matching"] == {"rule": "retrieval", "pairs": 25, **hash_inputs(solved.photos, FAST)}
 

@@ -56,7 +56,7 @@ def test_the_plan_can_be_read_and_names_the_files_that_are_skipped(tmp_path: Pat
 
 @pytest.mark.parametrize("command", ["poses", "run"])
 def test_the_quality_goes_to_the_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str):
-    calls: list[tuple[int, int]] = []
+    calls: list[tuple[int, int | None]] = []
 
     def estimate(folder: Path, scene: Path, *, settings: PoseSettings, **more: object) -> None:
         calls.append((settings.max_image_size, settings.max_features))

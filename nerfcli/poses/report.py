@@ -40,9 +40,10 @@ class PosesReport:
     seconds: per stage, for the call that wrote the report; time spent in earlier calls is not included. models: the
     sizes of all models found, the kept one first. attempts: the result of each mapping attempt, and the "doubt" that is
     left about the last one, if any. matching: the rule for pairs, their number, and hashes of the photos, masks and
-    files that were used. points: number of points of the kept model. intrinsics: the given intrinsics, see
-    `cameras.PhotoGroups`. strict: how held-out photos were placed afterwards, see `strict.place_held_out`. components:
-    each model's photos and why it is not joined to the largest, ordered by size.
+    files that were used. search: the search that the features are from, see `settings.Search`. points: number of points
+    of the kept model. intrinsics: the given intrinsics, see `cameras.PhotoGroups`. strict: how held-out photos were
+    placed afterwards, see `strict.place_held_out`. components: each model's photos and why it is not joined to the
+    largest, ordered by size.
     not_computed: checks that could not be computed, and why.
     cut_short: what was stopped because it took far longer than planned.
     moving_foreground: facts about an object that turns in front of a static background, and its masks; see `turntable`.
@@ -58,6 +59,7 @@ class PosesReport:
     models: tuple[int, ...]
     attempts: tuple[dict[str, Any], ...]
     matching: dict[str, Any]
+    search: dict[str, int]
     settings: PoseSettings
     versions: dict[str, str]
     verdict: dict[str, Any]

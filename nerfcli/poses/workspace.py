@@ -116,6 +116,8 @@ def is_same_scene(
         earlier = report.get("intrinsics")
         files = {key: value for key, value in report["matching"].items() if key.endswith("_key")}
         made_with = asdict(PoseSettings()) | report["settings"]  # settings newer than the report had their defaults
+        if "search" not in report and made_with["max_features"] == 4096:
+            made_with["max_features"] = None  # it was the default
         wanted = {key: value for key, value in asdict(settings).items() if key not in ("threads", "accept_refused")}
         return (
             made.resolve() == photos_dir.resolve()

@@ -22,7 +22,7 @@ from nerfcli.poses.engine.mapping import MappedModels, MapperOptions, map_photos
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import ALL_ALIKE_UP_TO, all_pairs
 from nerfcli.poses.input.plan import extraction_seconds, mapping_seconds, matching_seconds
-from nerfcli.poses.input.settings import FULL_SIZE, QUALITIES
+from nerfcli.poses.input.settings import FULL_SIZE, MOST_FEATURES
 from nerfcli.poses.judge.parallax import best_rotation_fit
 from nerfcli.poses.model.intrinsics import FISHEYE_FROM_DEG, field_of_view_deg
 from nerfcli.poses.model.lens_evidence import lenses_of
@@ -120,7 +120,7 @@ class MappingAttempts:
     def can_have_more_features(self) -> bool:
         """Return whether a higher limit, or larger pictures of not too many photos, would give any more features."""
         job, are_many = self.job, self.photos > _MOST_FOR_ALL
-        most = job.halved_from if are_many else QUALITIES["best"][1]
+        most = job.halved_from if are_many else MOST_FEATURES
         limited = job.max_features < most and max(feature_counts(job), default=0) >= job.max_features
         larger = any(max(group.width, group.height) > job.max_image_size for group in job.groups)
         return limited or (larger and not are_many)
@@ -317,7 +317,7 @@ def map_with_more_features(attempts: MappingAttempts) -> None:
 
 def _with_larger_pictures(job: Job, seconds: float) -> Job:
     """Return the job with all pairs, more features, and pictures as large as the CPU seconds allow."""
-    more = replace(job, variant="full-size", max_features=QUALITIES["best"][1], pairs=all_pairs(len(job.files)))
+    more = replace(job, variant="full-size", max_features=MOST_FEATURES, pairs=all_pairs(len(job.files)))
     matching = matching_seconds(len(more.pairs), max_features=more.max_features)
     full = _search_seconds(replace(more, max_image_size=FULL_SIZE)) - matching
     fraction = min(1.0, max(seconds - matching, 0.0) / full) ** 0.5  # of the longer side: time is proportional to area

@@ -52,6 +52,7 @@ def describe_result(chosen: ChosenModel, job: Job) -> dict[str, Any]:
         "cut_short": [*mapped.cut_short, *ended],
         "evidence": evidence(mapped.job),
         "pairs": len(mapped.job.pairs),
+        "search": {"max_image_size": mapped.job.max_image_size, "max_features": mapped.job.max_features},
         "versions": {"pycolmap": pycolmap.__version__, "ceres": pycolmap.__ceres_version__},
         "models": [placed, *(placed_names(other, job) for other in mapped.models[1:])] if mapped.models else [],
         "left_out": examined.left_out,

@@ -25,32 +25,37 @@ CAMERA_MODELS = (
 
 # More than the longer side of any photo, so that features are extracted at full size.
 FULL_SIZE = 100_000
+_USUAL_FEATURES, MOST_FEATURES = 4096, 8192
 # (max_image_size, max_features). Measured poses hardly change from the first to the last; the later ones place photos
 # that are hard to match more often.
-QUALITIES = {"fast": (1000, 2048), "default": (1600, 4096), "best": (FULL_SIZE, 8192)}
+QUALITIES: dict[str, tuple[int, int | None]] = {
+    "fast": (1000, 2048),
+    "default": (1600, None),
+    "best": (FULL_SIZE, MOST_FEATURES),
+}
 
 # From this many photos on, a photo has so many neighbours that fewer features place it as well, in two thirds of the
 # time or less: see "Hundreds of photos" in docs/research/poses.md.
-_MANY_PHOTOS, _FEATURES_OF_MANY = 100, QUALITIES["fast"][1]
+_MANY_PHOTOS = 100
 
 
 @dataclass(frozen=True)
 class PoseSettings:
     """Settings that the result depends on.
 
-    max_image_size: longer side of the pictures that are searched for features, pixels. max_features: per photo. Both
-    are doubled for panoramas, see `for_panoramas`, and the default is halved for many photos, see `search_for`.
-    threads: -1 for all; with 1 thread the same seed gives the same poses. camera_model: one of `CAMERA_MODELS`.
-    min_registered: the fraction of photos that must be placed, 0...1. pairing: one of `PAIRINGS`; with pairs_file, a
-    text file with two names per line, only these pairs are matched. masks: a folder of masks, see `photos.masks`.
-    holdout: the rule by which photos are held out, see `captures.holdout`. strict: whether held-out photos are placed
-    afterwards, with the result of the other photos fixed, see `strict`. accept_refused: whether a model that the checks
-    refuse becomes the scene anyway. subfolders: whether photos in subfolders are used, those of each as of a camera of
-    their own.
+    max_image_size: longer side of the pictures that are searched for features, pixels. max_features: per photo; None
+    for a number that depends on how many photos there are, see `search_for`. Both are doubled for panoramas, see
+    `for_panoramas`. threads: -1 for all; with 1 thread the same seed gives the same poses. camera_model: one of
+    `CAMERA_MODELS`. min_registered: the fraction of photos that must be placed, 0...1. pairing: one of `PAIRINGS`; with
+    pairs_file, a text file with two names per line, only these pairs are matched. masks: a folder of masks, see
+    `photos.masks`. holdout: the rule by which photos are held out, see `captures.holdout`. strict: whether held-out
+    photos are placed afterwards, with the result of the other photos fixed, see `strict`. accept_refused: whether a
+    model that the checks refuse becomes the scene anyway. subfolders: whether photos in subfolders are used, those of
+    each as of a camera of their own.
     """
 
     max_image_size: int = QUALITIES["default"][0]
-    max_features: int = QUALITIES["default"][1]
+    max_features: int | None = None
     seed: int = 0
     threads: int = -1
     camera_model: str = "auto"
@@ -82,10 +87,10 @@ class Search:
 
 
 def search_for(settings: PoseSettings, count: int) -> Search:
-    """Return the first search of this many photos: the default number of features is halved for 100 or more."""
-    if count < _MANY_PHOTOS or settings.max_features != QUALITIES["default"][1]:
-        return Search(settings.max_image_size, settings.max_features)
-    return Search(settings.max_image_size, _FEATURES_OF_MANY, settings.max_features)
+    """Return the first search of this many photos: by default for 4,096 features, or 2,048 in each of 100 or more."""
+    if settings.max_features is None and count >= _MANY_PHOTOS:
+        return Search(settings.max_image_size, _USUAL_FEATURES // 2, halved_from=_USUAL_FEATURES)
+    return Search(settings.max_image_size, settings.max_features or _USUAL_FEATURES)
 
 
 def for_panoramas(search: Search) -> Search:
@@ -100,7 +105,7 @@ def check_settings(settings: PoseSettings) -> None:
         ValueError: a setting is out of its range.
         UserError: there is no such folder or file.
     """
-    if settings.max_image_size < 1 or settings.max_features < 1:
+    if settings.max_image_size < 1 or (settings.max_features is not None and settings.max_features < 1):
         raise ValueError(
             f"image size and features must be positive, got {settings.max_image_size} and {settings.max_features}"
         )
