@@ -34,8 +34,8 @@ QUALITIES: dict[str, tuple[int, int | None]] = {
     "best": (FULL_SIZE, MOST_FEATURES),
 }
 
-# From this many photos on, a photo has so many neighbours that fewer features place it as well, in two thirds of the
-# time or less: see "Hundreds of photos" in docs/research/poses.md.
+# From this many photos on, half of the features gave the same poses in about half of the time or less: see "Hundreds of
+# photos" in docs/research/poses.md.
 _MANY_PHOTOS = 100
 
 
