@@ -51,7 +51,7 @@ class Facts:
         stereo: number of pixels with a depth from stereo matching.
         sensor: number of pixels with a depth from a sensor.
         sky_fraction: fraction of the pixels that look like a sky, see `matching.sky`.
-        sky_confirmed: whether 3D points confirm that it is one.
+        sky_confirmed: whether 3D points, or depths from stereo matching, confirm that it is one.
         is_plain: whether it is a plain background around an object.
         occluded_fraction: fraction of the pixels where something hides a surface that other photos see.
         has_attached: whether something is attached to a camera, see `matching.attached`.
