@@ -45,9 +45,7 @@ def test_a_sound_scan_is_sound() -> None:
     found = examine_scan(scan())
     verdicts = {each.check: each.verdict for each in found.findings}
     assert not found.not_checked
-    assert verdicts.pop("number of views") == "good"
-    assert set(verdicts.values()) == {"good"}, verdicts
-    assert len(verdicts) + 1 == len(CHECKS)
+    assert verdicts == dict.fromkeys(CHECKS, "good")
 
 
 def test_pixels_brighter_than_the_open_beam() -> None:
@@ -95,16 +93,6 @@ def test_an_object_wider_than_the_detector() -> None:
     assert "no column sees" not in str(found)
 
 
-@pytest.mark.parametrize(("held_out", "verdict"), [((), "look"), ((0, VIEWS), "look"), ((VIEWS,), "bad")])
-def test_0_and_360_degrees(held_out: tuple[int, ...], verdict: str) -> None:
-    circle = phantom_circle(views=VIEWS, columns=COLUMNS)
-    both = replace(circle, angles=(*circle.angles, circle.angles[0] + 2 * np.pi))
-    found = finding("repeated angles", replace(scan_of_phantom(both), held_out=held_out))
-    assert found.verdict == verdict
-    assert found.number == 1
-    assert "0 and 360 degrees" in found.summary
-
-
 @pytest.mark.parametrize(
     ("beam", "span", "missing", "verdict"),
     [
@@ -138,12 +126,6 @@ def test_empty_projections_are_no_air_and_no_views() -> None:
     assert (wedge.verdict, wedge.number) == ("bad", pytest.approx(180 * 60 / VIEWS, abs=4))
     bright = np.where(np.arange(COLUMNS) == 20, 0.9, 1.0)
     assert finding("rings", changed(cut, lambda values: values * bright)).verdict == "bad"
-
-
-def test_too_few_views_for_the_detector() -> None:
-    found = finding("number of views", scan_of_phantom(phantom_circle(views=24, columns=64)))
-    assert found.verdict == "look"
-    assert found.number == pytest.approx(20 / (np.pi / 2 * 64))
 
 
 @pytest.mark.parametrize("beam", ["cone", "parallel"])

@@ -199,9 +199,6 @@ def unusable(sample: Sample) -> Finding:
 
 TRUNCATED_LOOK, TRUNCATED_BAD = 0.02, 0.2
 WEDGE_BAD_DEG = 30.0
-FEW_LOOK, FEW_BAD = 1.0, 0.05
-# Views that differ by less than this fraction of the usual step count as views at the same angle.
-_SAME = 0.05
 # Largest deviation from a circle, in pixels, of a scan that is checked as a circular one.
 _ROUND_PX = 1.0
 
@@ -223,36 +220,6 @@ def truncation(sample: Sample) -> Finding:
         f"look from {100 * TRUNCATED_LOOK:g} %, bad from {100 * TRUNCATED_BAD:g} %; line integrals above "
         f"{sample.air_level:.2g} count as object",
         advice="values inside hold up to a smooth offset only: use a wider detector, or rely on edges, not on values",
-    )
-
-
-def repeated_angles(sample: Sample) -> Finding | str:
-    """Find views at the same angle, such as 0 and 360 degrees."""
-    around = _around(sample.scan.geometry)
-    if around is None:
-        return "the views are not on one circle"
-    angles, order, gaps, step = around
-    same = np.flatnonzero(gaps < _SAME * step)
-    pairs = [(int(order[k]), int(order[(k + 1) % len(order)])) for k in same]
-    held_out = set(sample.scan.held_out)
-    leaks = [pair for pair in pairs if (pair[0] in held_out) != (pair[1] in held_out)]
-    verdict = BAD if leaks else LOOK if pairs else GOOD
-    example = ""
-    if pairs:
-        first, second = sorted(pairs[0])
-        example = f": {np.degrees(angles[first]):.6g} and {np.degrees(angles[second]):.6g} degrees"
-    advice = ""
-    if leaks:
-        advice = "one of them is held out and the other is not: hold out both, or leave one out (--holdout FILE)"
-    elif pairs:
-        advice = "such a view counts twice: leave one out"
-    return finding(
-        "repeated angles",
-        verdict,
-        f"{several(len(pairs), 'pair')} of views at the same angle{example}",
-        float(len(pairs)),
-        "look from 1 pair, bad where one of them is held out",
-        advice=advice,
     )
 
 
@@ -294,23 +261,6 @@ def missing_wedge(sample: Sample) -> Finding | str:
         missing_deg,
         f"look from a span below 180 degrees and the fan, bad from {WEDGE_BAD_DEG:g} missing degrees",
         advice=advice,
-    )
-
-
-def few_views(sample: Sample) -> Finding:
-    """Compare the number of views with the width of the detector."""
-    geometry = sample.scan.geometry
-    views = len(sample.scan.training_views)
-    wanted = np.pi / 2 * geometry.columns
-    number = views / wanted
-    verdict = verdict_below(number, look=FEW_LOOK, bad=FEW_BAD)
-    return finding(
-        "number of views",
-        verdict,
-        f"{views} views to reconstruct from, {100 * number:.3g} % of pi/2 x {geometry.columns} columns",
-        number,
-        f"look below {100 * FEW_LOOK:g} %, bad below {100 * FEW_BAD:g} %",
-        advice="filtered back-projection will show streaks: fit with total variation, or use larger pixels",
     )
 
 

@@ -27,9 +27,7 @@ CHECKS: dict[str, Check] = {
     "counts": checks.counts,
     "dead pixels": checks.unusable,
     "truncation": checks.truncation,
-    "repeated angles": checks.repeated_angles,
     "missing wedge": checks.missing_wedge,
-    "number of views": checks.few_views,
     "centre of rotation": checks.centre,
     "beam hardening": checks.beam_hardening,
 }

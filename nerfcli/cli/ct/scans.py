@@ -155,9 +155,9 @@ def doctor(
 ) -> None:
     """Check a scan for problems before the reconstruction.
 
-    Checks I > I0, drift, rings, counts, truncation, directions and number of views, the centre of rotation and beam
-    hardening. Prints a table on stderr and writes a page with the sinogram next to the scan, SCAN-doctor.html. Each
-    finding is good, look or bad, with its number, its threshold and advice.
+    Checks I > I0, drift, rings, counts, truncation, missing directions, the centre of rotation and beam hardening.
+    Prints a table on stderr and writes a page with the sinogram next to the scan, SCAN-doctor.html. Each finding is
+    good, look or bad, with its number, its threshold and advice.
 
     \b
     Examples:
