@@ -7,7 +7,7 @@ from skimage.filters import threshold_otsu
 
 from nerfcli.ct.centre import FEWEST_VIEWS, FINE, centre_of
 from nerfcli.ct.formats.assemble import axis_column
-from nerfcli.ct.geometry import ScanGeometry, circle_of
+from nerfcli.ct.marks import WEDGE_DEG, missing_wedge_deg
 from nerfcli.ct.open_beam import MEDIAN_DEVIATION
 from nerfcli.ct.quick import highest_contrast_row, predicted, reconstructed
 from nerfcli.ct.scan import Scan
@@ -199,8 +199,6 @@ def unusable(sample: Sample) -> Finding:
 
 TRUNCATED_LOOK, TRUNCATED_BAD = 0.02, 0.2
 WEDGE_BAD_DEG = 30.0
-# Largest deviation from a circle, in pixels, of a scan that is checked as a circular one.
-_ROUND_PX = 1.0
 
 
 def truncation(sample: Sample) -> Finding:
@@ -223,67 +221,17 @@ def truncation(sample: Sample) -> Finding:
     )
 
 
-def missing_wedge(sample: Sample) -> Finding | str:
+def missing_wedge(sample: Sample) -> Finding:
     """Find the directions that no ray covers."""
-    geometry = sample.scan.geometry.select(sample.scan.live_views)
-    around = _around(geometry)
-    if around is None:
-        return "the views are not on one circle"
-    angles, order, gaps, step = around
-    widest, fan = int(np.argmax(gaps)), _fan(geometry)
-    gap = float(gaps[widest])
-    # If the gap in the source's path is below half a turn minus the fan, each line is measured from its other end.
-    span = 2 * np.pi - (gap if gap > 2 * step else 0.0)
-    missing = np.pi - span - (step if geometry.beam == "parallel" else 0.0)
-    missing = missing if missing > step / 2 else 0.0
-    missing_deg, span_deg = float(np.degrees(missing)), float(np.degrees(span))
-    once = span < np.pi + fan - step and missing == 0
-    begin = float(np.degrees(np.mod(angles[order[widest]], 2 * np.pi)))
-    verdict = BAD if missing_deg >= WEDGE_BAD_DEG else LOOK if missing_deg > 0 or once else GOOD
-    if missing_deg > 0:
-        at = np.mod([begin, begin + missing_deg], 180)
-        summary = (
-            f"views span {span_deg:.4g} degrees: a wedge of {missing_deg:.4g} degrees is missing, ray directions "
-            f"{at[0]:.4g} to {at[1]:.4g}"
-        )
-        advice = "edges along the missing directions cannot be reconstructed; the volume is marked there"
-    elif once:
-        summary = f"views span {span_deg:.4g} degrees, less than 180 and the fan of {np.degrees(fan):.3g}"
-        advice = (
-            "some lines at the border of the object were not measured: scan a larger angle, or expect shading there"
-        )
-    else:
-        summary, advice = f"views span {span_deg:.4g} degrees, no direction is missing", ""
+    missing = missing_wedge_deg(sample.scan.geometry.select(sample.scan.live_views))
     return finding(
         "missing wedge",
-        verdict,
-        summary,
-        missing_deg,
-        f"look from a span below 180 degrees and the fan, bad from {WEDGE_BAD_DEG:g} missing degrees",
-        advice=advice,
+        verdict_above(missing, look=WEDGE_DEG, bad=WEDGE_BAD_DEG),
+        f"a wedge of {missing:.4g} degrees is missing" if missing else "the directions of rays go all around",
+        missing,
+        f"look from {WEDGE_DEG:g} degrees, bad from {WEDGE_BAD_DEG:g}",
+        advice="edges along the missing directions cannot be reconstructed; the volume is marked there",
     )
-
-
-def _around(geometry: ScanGeometry) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
-    """Return angles of a circular scan, their order around the circle, the gap after each in it, and the usual gap."""
-    circle, apart = circle_of(geometry)
-    if apart >= _ROUND_PX:
-        return None
-    angles = np.array(circle.angles)
-    turned = np.mod(angles, 2 * np.pi)
-    order = np.argsort(turned)
-    gaps = np.diff(turned[order], append=turned[order[0]] + 2 * np.pi)
-    steps = gaps[:-1][gaps[:-1] > 1e-9]
-    return angles, order, gaps, float(np.median(steps)) if len(steps) else 2 * np.pi
-
-
-def _fan(geometry: ScanGeometry) -> float:
-    """Return the fan angle of the middle row; 0 for parallel beams."""
-    if geometry.beam == "parallel":
-        return 0.0
-    _, directions = geometry.rays(np.array([0]))
-    row = directions[0, geometry.rows // 2]
-    return float(np.arccos(np.clip(row[0] @ row[-1], -1, 1)))
 
 
 CENTRE_LOOK, CENTRE_BAD = 0.3, 1.0
