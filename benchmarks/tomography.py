@@ -16,19 +16,34 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import torch
 import typer
 from rich.console import Console
 from rich.table import Table
+from torch import Tensor
 
 from nerfcli import kernels
-from nerfcli.ct.evaluate import evaluate_scan
+from nerfcli.ct.baselines import logarithms
+from nerfcli.ct.evaluate import evaluate_scan, held_out_air, score_projections, score_volume
 from nerfcli.ct.formats.read import read_scan
-from nerfcli.ct.result import ReconstructionSettings
+from nerfcli.ct.geometry import ScanGeometry
+from nerfcli.ct.grid import VoxelGrid
+from nerfcli.ct.reconstruct import Projector
+from nerfcli.ct.result import Reconstruction, ReconstructionSettings, scan_of
 from nerfcli.ct.scan import Scan, save_scan
 from nerfcli.ct.train import train_scan
+from nerfcli.ct.truth import load_truth
 from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
 from nerfcli.output import Output
+
+# Number of rounds over all views; relaxation of the first round and its decay per round.
+SART_ROUNDS = 8
+RELAXATION, DECAY = 0.3, 0.9
+# Threshold of SART's total variation, as a fraction of the largest attenuation, times the number of views. It was found
+# on a tooth at 60, 30 and 15 views (0.004, 0.008, 0.015).
+TV_OF_VIEWS = 0.24
+TV_STEPS = 20
 
 
 @dataclass(frozen=True)
@@ -68,6 +83,53 @@ def thinned(scan: Scan, views: int) -> Scan:
     return replace(scan, geometry=scan.geometry.select(index), values=scan.values[index], held_out=held_out, **arrays)
 
 
+def sart_total_variation(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGrid) -> Tensor:
+    """Reconstruct by SART with positivity and total variation denoising after each round over the views.
+
+    Args:
+        integrals: (V, rows, columns) line integrals.
+
+    Returns:
+        (Z, Y, X) attenuation, >= 0.
+
+    Source: Andersen and Kak 1984, Simultaneous algebraic reconstruction technique, Ultrasonic Imaging 6; Chambolle 2004
+    for the denoising.
+    """
+    projector = Projector(geometry, grid)
+    backend = kernels.backend_for(torch.device("cpu"), torch.float32)
+    ones = torch.ones(grid.shape)
+    volume, dual = torch.zeros(grid.shape), torch.zeros(3, *grid.shape)
+    measured = torch.from_numpy(np.ascontiguousarray(integrals, dtype=np.float32).reshape(geometry.views, -1))
+    order = sorted(range(geometry.views), key=lambda view: int(format(view, "016b")[::-1], 2))
+    for number in range(SART_ROUNDS):
+        for view in order:
+            index = np.array([view])
+            chord = projector.forward(ones, index)
+            left = (measured[index] - projector.forward(volume, index)) / chord.clamp_min(grid.size)
+            left = torch.where(chord > 0, left, 0)
+            met = projector.backward(torch.ones_like(chord), index)
+            step = projector.backward(left, index) / met.clamp_min(1e-3 * float(met.max()) + 1e-30)
+            volume = (volume + RELAXATION * DECAY**number * step).clamp_min(0)
+        threshold = torch.full(grid.shape, TV_OF_VIEWS / geometry.views * float(volume.max()) + 1e-30)
+        volume = backend.denoise_total_variation(volume, threshold, dual.zero_(), iterations=TV_STEPS)
+    return volume
+
+
+def scores_of_sart(scan: Scan, result: Reconstruction) -> dict[str, Any]:
+    """Return the metrics of SART with total variation, from the views and with the geometry of a reconstruction."""
+    geometry, truth = scan.geometry.corrected(result.used["centre"], result.used["tilt"]), load_truth(scan.history)
+    assert truth is not None
+    integrals = logarithms(scan, result.used["air"])
+    volume = sart_total_variation(geometry.select(scan.training_views), integrals, result.grid)
+    air = held_out_air(scan, geometry, result)
+    projections = score_projections(scan, geometry, volume, result.grid, air=air)
+    assert projections is not None
+    return {
+        "projections": asdict(projections),
+        "volume": asdict(score_volume(volume.numpy(), result.grid, truth[1], truth[0])),
+    }
+
+
 def main(
     scan: Annotated[Path, typer.Argument()],
     output: Annotated[Path, typer.Option("-o")],
@@ -78,7 +140,7 @@ def main(
     passes: Annotated[int | None, typer.Option(help="Passes, instead of a time.")] = None,
     photons: float = 2e4,
     threads: int = 2,
-    baselines: Annotated[bool, typer.Option(help="Other methods too, for the first seed.")] = True,
+    baselines: Annotated[bool, typer.Option(help="SART with total variation, too, for the first seed.")] = True,
     processor_time: Annotated[
         bool, typer.Option(help="Budgets count seconds of processor time per thread, for a machine with other work.")
     ] = False,
@@ -103,11 +165,10 @@ def main(
                 begun, used = clock(), time.process_time()
                 result = train_scan(folder, Output(run, overwrite=True), settings, reporter=Reporter(note=print))
                 spent = {"clock_s": clock() - begun, "cpu_s": time.process_time() - used}
-                others = baselines and seed == first_seed
-                metrics = evaluate_scan(
-                    run, Output(overwrite=True), baselines=others, resources=Resources(threads)
-                ).metrics
-                for name, found in metrics["methods"].items():
+                methods = evaluate_scan(run, Output(overwrite=True), resources=Resources(threads)).metrics["methods"]
+                if baselines and seed == first_seed:
+                    methods["SART with total variation"] = scores_of_sart(scan_of(result, run), result)
+                for name, found in methods.items():
                     own = name == "nerfcli"
                     projections, volume = found["projections"], found["volume"]
                     line = Line(

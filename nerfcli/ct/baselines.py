@@ -1,8 +1,4 @@
-"""Baseline reconstructions: filtered back-projection, and SART with total variation.
-
-Both use the same views as the fit, and SART also its projector. Line integrals are logarithms of the data here, as in
-established reconstruction programs.
-"""
+"""Filtered back-projection of the views of a fit, to compare with; of logarithms of the data, as is usual."""
 
 from collections.abc import Sequence
 
@@ -11,20 +7,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from nerfcli import kernels
 from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.grid import VoxelGrid
 from nerfcli.ct.reconstruct import Projector
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
 
-# Number of rounds over all views; relaxation of the first round and its decay per round.
-SART_ROUNDS = 8
-RELAXATION, DECAY = 0.3, 0.9
-# Threshold of SART's total variation, as a fraction of the largest attenuation, times the number of views. It was found
-# on a tooth at 60, 30 and 15 views (0.004, 0.008, 0.015).
-TV_OF_VIEWS = 0.24
-TV_STEPS = 20
 # Largest deviation of a geometry from a circle around z, as a fraction of its radius and in cosines.
 _CIRCULAR = 1e-3
 
@@ -113,38 +101,6 @@ def filtered_misfit(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGr
     return float((left * _ramp(left.astype(np.float64), 1.0)).sum())
 
 
-def sart_total_variation(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGrid) -> Tensor:
-    """Reconstruct by SART with positivity and total variation denoising after each round over the views.
-
-    Args:
-        integrals: (V, rows, columns) line integrals.
-
-    Returns:
-        (Z, Y, X) attenuation, >= 0.
-
-    Source: Andersen and Kak 1984, Simultaneous algebraic reconstruction technique, Ultrasonic Imaging 6; Chambolle 2004
-    for the denoising.
-    """
-    projector = Projector(geometry, grid)
-    backend = kernels.backend_for(torch.device("cpu"), torch.float32)
-    ones = torch.ones(grid.shape)
-    volume, dual = torch.zeros(grid.shape), torch.zeros(3, *grid.shape)
-    measured = torch.from_numpy(np.ascontiguousarray(integrals, dtype=np.float32).reshape(geometry.views, -1))
-    order = sorted(range(geometry.views), key=lambda view: int(format(view, "016b")[::-1], 2))
-    for number in range(SART_ROUNDS):
-        for view in order:
-            index = np.array([view])
-            chord = projector.forward(ones, index)
-            left = (measured[index] - projector.forward(volume, index)) / chord.clamp_min(grid.size)
-            left = torch.where(chord > 0, left, 0)
-            met = projector.backward(torch.ones_like(chord), index)
-            step = projector.backward(left, index) / met.clamp_min(1e-3 * float(met.max()) + 1e-30)
-            volume = (volume + RELAXATION * DECAY**number * step).clamp_min(0)
-        threshold = torch.full(grid.shape, TV_OF_VIEWS / geometry.views * float(volume.max()) + 1e-30)
-        volume = backend.denoise_total_variation(volume, threshold, dual.zero_(), iterations=TV_STEPS)
-    return volume
-
-
 def _ramp(projections: np.ndarray, width: float) -> np.ndarray:
     """Filter projections along their rows by the ramp, sampled in space (Kak and Slaney 1988, equation 3.61)."""
     count = projections.shape[-1]
@@ -165,5 +121,5 @@ def _check_circle(geometry: ScanGeometry, outward: np.ndarray) -> None:
     if not (circular and upright):
         raise UserError(
             "filtered back-projection needs a source on a circle around z and an upright detector",
-            "compare with SART instead",
+            "use it for scans on a circle",
         )

@@ -1,4 +1,4 @@
-"""Evaluate a reconstruction on held-out projections and the true volume, next to other methods on the same views."""
+"""Evaluate a reconstruction on held-out projections and the true volume, next to filtered back-projection."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 from skimage.metrics import structural_similarity
 
 from nerfcli.atomic import read_json, refuse_read_only, write_json
-from nerfcli.ct.baselines import filtered_back_projection, logarithms, sart_total_variation
+from nerfcli.ct.baselines import filtered_back_projection, logarithms
 from nerfcli.ct.calibrate import air_factors
 from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.grid import VoxelGrid
@@ -76,17 +76,17 @@ def evaluate_scan(
     run: str | Path,
     output: Output = Output(),
     *,
-    baselines: bool = True,
     reference: str | Path | None = None,
     resources: Resources = Resources(),
     reporter: Reporter = Reporter(),
 ) -> ScanEvaluation:
     """Write RUN/metrics.json: errors of held-out projections and, if the scan names its true volume, of the volume.
 
+    Filtered back-projection of the same views is measured, too.
+
     Args:
         run: the folder that `train_scan` wrote.
         output: the file to write, RUN/metrics.json by default.
-        baselines: also measure filtered back-projection and SART with total variation on the same views.
         reference: folder of another reconstruction, usually from more views, to compare volumes with. It is not the
             truth: it has errors too, and errors common to both do not show.
 
@@ -110,34 +110,29 @@ def evaluate_scan(
     refuse_read_only(path)
     scan = scan_of(result, run)
     geometry = scan.geometry.corrected(result.used["centre"], result.used["tilt"])
-    truth, air = load_truth(scan.history), held_out_air(scan, geometry, result)
-    methods: dict[str, Any] = {}
-
-    def measure(name: str, volume: np.ndarray) -> None:
+    volumes = {"nerfcli": np.asarray(result.volume)}
+    reporter.progress(0.0, "filtered back-projection")
+    try:
+        integrals = logarithms(scan, result.used["air"])
+        filtered = filtered_back_projection(geometry.select(scan.training_views), integrals, result.grid)
+        volumes["filtered back-projection"] = filtered.clamp_min(0).numpy()
+    except UserError as error:
+        reporter.note(f"no filtered back-projection: {error.message}")
+    reporter.progress(0.5, "held-out views")
+    others = {
+        "volume": load_truth(scan.history),
+        "against_reference": None if compared is None else (compared.grid, compared.volume),
+    }
+    air, methods = held_out_air(scan, geometry, result), {}
+    for name, volume in volumes.items():
         projections = score_projections(scan, geometry, torch.from_numpy(np.array(volume)), result.grid, air=air)
         methods[name] = {
             "projections": None if projections is None else asdict(projections),
-            "volume": None if truth is None else asdict(score_volume(volume, result.grid, truth[1], truth[0])),
-            "against_reference": None
-            if compared is None
-            else asdict(score_volume(volume, result.grid, compared.volume, compared.grid)),
+            **{
+                what: None if other is None else asdict(score_volume(volume, result.grid, other[1], other[0]))
+                for what, other in others.items()
+            },
         }
-
-    reporter.progress(0.0, "held-out views")
-    measure("nerfcli", np.asarray(result.volume))
-    if baselines:
-        views = scan.training_views
-        integrals = logarithms(scan, result.used.get("air"))
-        reporter.progress(0.3, "filtered back-projection")
-        try:
-            filtered = filtered_back_projection(geometry.select(views), integrals, result.grid)
-            measure("filtered back-projection", filtered.clamp_min(0).numpy())
-        except UserError as error:
-            reporter.note(f"no filtered back-projection: {error.message}")
-        reporter.progress(0.5, "SART with total variation")
-        measure(
-            "SART with total variation", sart_total_variation(geometry.select(views), integrals, result.grid).numpy()
-        )
     metrics = {
         "measurement": MEASUREMENT,
         "scan_digest": result.scan_digest,

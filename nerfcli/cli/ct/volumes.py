@@ -35,8 +35,7 @@ def evaluate(
     """Evaluate a reconstruction on its held-out views.
 
     Writes RUN/metrics.json: line integrals of held-out views (rms, dB, chi-square against the noise), the volume where
-    the scan names a true one, and the same of filtered back-projection and of SART with total variation from the same
-    views.
+    the scan names a true one, and the same of filtered back-projection from the same views.
 
     \b
     Examples:
