@@ -214,7 +214,7 @@ def test_what_is_no_time(text):
         ("export x --to mesh --sh 0", "it is for splats"),
         ("export x --to mesh -o a.stl", "not have the suffix of a mesh"),
         ("ct train x y", "(y); give one, or several on standard input: ls -d scans/*/ | nerfcli ct train -"),
-        ("ct convert x", "missing; give the folder to write"),
+        ("ct convert x", "Missing argument 'SCAN'"),
         ("export x --to mesh --format obj -o x.ply", "'obj' contradicts -o x.ply"),
         ("train x y", "(y); give one, or several on standard input: ls -d *-scene/ | nerfcli train -"),
         ("train x --downscale 3", "'3'; choose auto, 1, 2, 4 or 8"),

@@ -1,6 +1,7 @@
 """Checks of nerfcli doctor on scans of a phantom with one fault each, and on one without."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from scan_of_phantom import phantom_circle, scan_of_phantom
 
 from nerfcli.ct.checks import sample_of
 from nerfcli.ct.examine import CHECKS, examine_scan
+from nerfcli.ct.geometry import Beam
 from nerfcli.ct.scan import Scan, save_scan
 from nerfcli.errors import GATE_NOT_MET
 from nerfcli.pages.findings import Finding
@@ -104,10 +106,9 @@ def test_an_object_wider_than_the_detector() -> None:
         ("cone", 190, 0, "good"),
     ],
 )
-def test_the_missing_wedge_is_named(beam: str, span: float, missing: float, verdict: str) -> None:
+def test_the_missing_wedge_is_named(beam: Beam, span: float, missing: float, verdict: str) -> None:
     """Closed form, within two steps between views."""
-    kind = "cone" if beam == "cone" else "parallel"
-    circle = phantom_circle(beam=kind, views=VIEWS, columns=COLUMNS, span_deg=span)
+    circle = phantom_circle(beam=beam, views=VIEWS, columns=COLUMNS, span_deg=span)
     found = finding("missing wedge", scan_of_phantom(circle))
     assert found.verdict == verdict
     assert found.number == pytest.approx(missing, abs=2 * span / VIEWS)
@@ -127,15 +128,41 @@ def test_empty_projections_are_no_air_and_no_views() -> None:
     assert finding("rings", changed(cut, lambda values: values * bright)).verdict == "bad"
 
 
+@pytest.mark.parametrize("truth", ["as stated", "mirrored", "reversed", "both"])
+def test_a_mirrored_detector_is_recognized_with_a_fan_beam(truth: str) -> None:
+    """A wrong side is worse by a large margin; mirrored and reversed together give the mirror image, which holds."""
+    circle = phantom_circle()
+    angles = tuple(-a for a in circle.angles) if truth in ("reversed", "both") else circle.angles
+    real = replace(circle, angles=angles, mirrored=truth in ("mirrored", "both"))
+    found = finding("side and direction", scan_of_phantom(real, stated=circle, photons=2e4))
+    assert found.verdict == ("bad" if truth in ("mirrored", "reversed") else "good")
+    assert found.number is not None
+    assert found.number > 1.5
+    assert ("--mirrored" in found.advice) == (found.verdict == "bad")
+
+
+def test_parallel_beams_and_air_decide_nothing_and_the_reason_is_reported() -> None:
+    parallel = scan_of_phantom(phantom_circle(beam="parallel", span_deg=180))
+    assert "parallel beams cannot tell" in str(checked("side and direction", parallel))
+    air = scan_of_phantom(phantom_circle())
+    noise = np.random.default_rng(0).normal(0, 0.01, air.values.shape)
+    assert "predict other views as well" in str(checked("side and direction", changed(air, lambda _: noise)))
+    assert checked("side and direction", scan_of_phantom(phantom_circle(views=5))) == "too few views"
+
+
 @pytest.mark.parametrize("beam", ["cone", "parallel"])
-def test_a_centre_off_the_middle(beam: str) -> None:
-    kind = "cone" if beam == "cone" else "parallel"
-    circle = phantom_circle(beam=kind, views=48, columns=COLUMNS, span_deg=360)
-    moved = scan_of_phantom(replace(circle, column_shift=2.5), stated=circle, photons=3e4)
+@pytest.mark.parametrize("shift", [-3.3, 0.0, 2.5, 5.75])
+def test_a_centre_off_the_middle(beam: Beam, shift: float) -> None:
+    """Known truth: within 0.1 columns."""
+    circle = phantom_circle(beam=beam, views=48, columns=COLUMNS)
+    moved = scan_of_phantom(replace(circle, column_shift=shift), stated=circle, photons=3e4)
     found = finding("centre of rotation", moved)
-    assert found.verdict == "bad"
-    assert found.number == pytest.approx(2.5, abs=0.1)
-    assert "--centre-of-rotation 21.0" in found.advice or "--centre-of-rotation 20.9" in found.advice
+    assert found.verdict == ("bad" if shift else "good")
+    assert found.number == pytest.approx(abs(shift), abs=0.1)
+    column = re.search("--centre-of-rotation ([0-9.]+)", found.advice)
+    assert (column is not None) == (shift != 0)
+    if column is not None:
+        assert float(column[1]) == pytest.approx((COLUMNS - 1) / 2 - shift, abs=0.1)
 
 
 @pytest.mark.parametrize(("bend", "verdict"), [(0.0, "good"), (0.10, "look"), (0.30, "bad")])

@@ -14,7 +14,6 @@ from tomography import sart_total_variation
 from nerfcli.ct import reconstruct as reconstruction
 from nerfcli.ct.baselines import filtered_back_projection, filtered_misfit, logarithms
 from nerfcli.ct.calibrate import air_factors, detector_tilt, found_noise
-from nerfcli.ct.centre import centre_of
 from nerfcli.ct.evaluate import resampled, score_projections, score_volume
 from nerfcli.ct.geometry import Circle, ScanGeometry
 from nerfcli.ct.grid import VoxelGrid, centred_grid, grid_of_scan
@@ -307,18 +306,6 @@ def test_model_error_is_found_where_it_is_put_in(generator: torch.Generator) -> 
         counts = torch.poisson(beam * torch.exp(-off), generator=generator)
         found = Poisson(counts, beam, torch.zeros_like(beam)).found_model_error(true, views)
         assert found == pytest.approx(error, rel=0.1, abs=7e-4)
-
-
-@pytest.mark.parametrize("shift", [-1.7, 0.0, 2.4])
-def test_centre_of_rotation_is_found(shift: float) -> None:
-    geometry = cone(60, rows=5)
-    scan = scan_of(geometry)
-    misaligned = Scan(
-        geometry.shifted(-shift), "counts", scan.values, scan.open_beam, photons_per_value=scan.photons_per_value
-    )
-    found = centre_of(highest_contrast_row(misaligned))
-    assert found.shift == pytest.approx(shift, abs=0.15)
-    assert found.is_off == (shift != 0)
 
 
 def test_tilt_of_the_detector_is_found() -> None:

@@ -1,15 +1,16 @@
-"""Checks of a scan: of its measured values (open beam, drift, rings, counts) and of its views."""
+"""Checks of a scan: of its measured values (open beam, drift, rings, counts), of its views and of their geometry."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from skimage.filters import threshold_otsu
 
-from nerfcli.ct.centre import FEWEST_VIEWS, FINE, centre_of
+from nerfcli.ct.centre import FEWEST_VIEWS, FINE, SIGNIFICANT, Centre, centre_of, margin
 from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.marks import WEDGE_DEG, missing_wedge_deg
 from nerfcli.ct.open_beam import MEDIAN_DEVIATION
-from nerfcli.ct.quick import highest_contrast_row, predicted, reconstructed
+from nerfcli.ct.quick import Row, highest_contrast_row, predicted, reconstructed
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import several
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, finding, verdict_above, verdict_below, worst
@@ -48,6 +49,16 @@ class Sample:
     def air_level(self) -> float:
         """The line integral above which a pixel shows the object."""
         return max(0.05 * self.object_level, 4 * self.noise)
+
+    @cached_property
+    def row(self) -> Row:
+        """The row with the most contrast."""
+        return highest_contrast_row(self.scan).thinned()
+
+    @cached_property
+    def centre(self) -> Centre:
+        """The centre of rotation, with columns and direction as stated."""
+        return centre_of(self.row)
 
 
 def sample_of(scan: Scan) -> Sample:
@@ -234,26 +245,52 @@ def missing_wedge(sample: Sample) -> Finding:
     )
 
 
+# Least ratio of the rms for a verdict, besides significance: smaller differences come from how a fit treats noise.
+LEAST_RATIO = 1.05
 CENTRE_LOOK, CENTRE_BAD = 0.3, 1.0
 HARDENING_LOOK, HARDENING_BAD = 0.05, 0.25
 # Below this fraction of explained variance, the object has several materials, whose effect looks like beam hardening.
 ONE_MATERIAL = 0.97
 
 
+def side(sample: Sample) -> Finding | str:
+    """Find a mirrored detector, or a reversed rotation, by what predicts other views; both at once mirror the object.
+
+    A scan that is read wrongly still gives a picture. Parallel beams cannot tell: with a mirrored detector, they see
+    the object turned by half a turn, and with a reversed rotation, its mirror image.
+    """
+    if sample.scan.geometry.beam == "parallel":
+        return (
+            "parallel beams cannot tell a mirrored detector or a reversed rotation from the object turned or mirrored"
+        )
+    if len(sample.scan.live_views) < FEWEST_VIEWS:
+        return "too few views"
+    mirrored = centre_of(sample.row, mirrored=True)
+    better, worse = sorted((sample.centre, mirrored), key=lambda found: float(found.errors.mean()))
+    errors, ratio = margin(better.errors, worse.errors)
+    if errors <= SIGNIFICANT or ratio <= LEAST_RATIO:
+        return "columns and direction as stated predict other views as well as mirrored ones"
+    return finding(
+        "side and direction",
+        BAD if better is mirrored else GOOD,
+        f"{'mirrored columns predict' if better is mirrored else 'as stated, the views predict'} others {ratio:.3g} "
+        f"times better ({errors:.1f} standard errors)",
+        ratio,
+        f"bad if a mirrored detector predicts better, from {LEAST_RATIO:g} times and {SIGNIFICANT:g} standard errors",
+        advice="convert with --mirrored, or state the other direction of rotation, and check the result; both at once "
+        "mirror the object, which only a feature of known handedness shows",
+    )
+
+
 def centre(sample: Sample) -> Finding | str:
     """Estimate the centre of rotation."""
-    scan = sample.scan
-    if len(scan.live_views) < FEWEST_VIEWS:
+    if len(sample.scan.live_views) < FEWEST_VIEWS:
         return "too few views"
-    row = highest_contrast_row(scan)
-    stated = axis_column(scan.geometry)
-    found = centre_of(row.thinned())
+    found, stated = sample.centre, axis_column(sample.scan.geometry)
     column = stated - found.shift
-    number = abs(found.shift) if found.is_off else 0.0
-    verdict = verdict_above(number, look=CENTRE_LOOK, bad=CENTRE_BAD)
     return finding(
         "centre of rotation",
-        verdict,
+        verdict_above(abs(found.shift) if found.is_off else 0.0, look=CENTRE_LOOK, bad=CENTRE_BAD),
         f"axis at column {column:.2f} ± {found.error:.2f}; the scan states {stated:.2f}",
         abs(found.shift),
         f"look from {CENTRE_LOOK:g} columns, bad from {CENTRE_BAD:g}, if it predicts other views significantly better",
@@ -265,7 +302,7 @@ def beam_hardening(sample: Sample) -> Finding | str:
     """Measure how far line integrals fall below proportionality to path lengths, in an object of one material."""
     if len(sample.scan.live_views) < FEWEST_VIEWS:
         return "too few views"
-    row = highest_contrast_row(sample.scan).thinned().binned(FINE)
+    row = sample.row.binned(FINE)
     volume, grid = reconstructed(row)
     inside = volume > threshold_otsu(volume)
     lengths = predicted(inside.astype(np.float32), row, grid)

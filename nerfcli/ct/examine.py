@@ -28,6 +28,7 @@ CHECKS: dict[str, Check] = {
     "dead pixels": checks.unusable,
     "truncation": checks.truncation,
     "missing wedge": checks.missing_wedge,
+    "side and direction": checks.side,
     "centre of rotation": checks.centre,
     "beam hardening": checks.beam_hardening,
 }

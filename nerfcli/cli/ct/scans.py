@@ -2,7 +2,7 @@
 
 import math
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,7 +20,6 @@ from nerfcli.machine import thread_count
 from nerfcli.output import Output
 
 if TYPE_CHECKING:
-    from nerfcli.ct.detect import Judgement
     from nerfcli.ct.formats.statement import ScanOptions
     from nerfcli.ct.result import ReconstructionSettings
 
@@ -64,13 +63,9 @@ def convert(
         str, typer.Argument(metavar="IN", help="Scan: file or folder, or - to read paths from standard input.")
     ],
     target: Annotated[
-        Path | None,
-        typer.Argument(metavar="SCAN", help="Folder to write; with -, the folder that will contain the results."),
-    ] = None,
+        Path, typer.Argument(metavar="SCAN", help="Folder to write; with -, the folder that will contain the results.")
+    ],
     *,
-    detect: Annotated[
-        bool, typer.Option("--detect", help="Write nothing; detect direction, side and centre of rotation.")
-    ] = False,
     stated: ScanStatements,
     overwrite: Overwrite = False,
     printing: Printing,
@@ -81,68 +76,24 @@ def convert(
     Formats read: DataExchange and NXtomo (.h5, .nxs), Nikon (.xtekct), SkyScan (.log), HelTomo (.mat), R2-Gaussian
     (meta_data.json), pictures with a scan.json that states what they are; see docs/tomography.md.
 
-    SCAN/scene.json has ASTRA's vectors. What was written is read back and compared. --detect ranks the direction of
-    rotation, the side that columns are numbered from, and the centre of rotation by how well they predict other views.
+    SCAN/scene.json has ASTRA's vectors. What was written is read back and compared.
 
     \b
     Examples:
       nerfcli ct convert tooth.h5 tooth
-      nerfcli ct convert tooth.h5 --detect
       nerfcli ct convert tooth.h5 tooth --centre-of-rotation 295.8 --overwrite
       ls *.xtekct | nerfcli ct convert - scans/
     """
-    if detect and target is not None:
-        raise typer.BadParameter("--detect writes nothing; leave SCAN out")
-    if not detect and target is None:
-        raise typer.BadParameter("missing; give the folder to write", param_hint="SCAN")
     console, statements = printing.console, stated.given()
 
     def work(given: Given) -> None:
         from nerfcli.ct.convert import convert_scan
 
-        if target is None:
-            _detect(given.path, statements, console)
-            return
         place = place_of(given, target)
         record = convert_scan(given.path, Output(place, overwrite), given=statements, reporter=console.reporter)
         console.result(place, record)
 
     for_each_input(source, work, command="ct convert")
-
-
-def _detect(path: Path, statements: "ScanOptions", console: Console) -> None:
-    from nerfcli.ct.detect import detect_scan
-
-    with console.stage(f"detect {path.name}") as reporter:
-        found = detect_scan(path, given=statements, reporter=reporter)
-    record = {**asdict(found), "options": found.options}
-    console.facts(path, record, "\n".join([str(path), *_table(found)]))
-
-
-def _table(found: "Judgement") -> list[str]:
-    lines = [f"  {'reading':<52}{'axis at column':>16}{'rms error':>12}"]
-    for name, reading in {"as stated": found.as_stated, "mirrored, or reversed": found.mirrored}.items():
-        lines.append(f"  {name:<52}{reading.centre_column:>16.2f}{reading.rms:>12.4g}")
-    verdict = {
-        "holds": "as stated; the mirrored reading is worse",
-        "mirrored": "mirrored or reversed; as stated is worse",
-        "undecided": "the data do not decide",
-    }[found.verdict]
-    lines.append(
-        f"  direction and side: {verdict} ({found.ratio:.3g} times, {found.standard_errors:.1f} standard errors)"
-    )
-    centre = f"{found.centre_column:.2f} +- {found.centre_error:.2f}"
-    if found.centre_holds:
-        lines.append(f"  centre of rotation: column {centre}; {found.stated_column:.2f} as stated fits as well")
-    else:
-        lines.append(
-            f"  centre of rotation: column {centre}; {found.stated_column:.2f} as stated is {found.centre_ratio:.3g} "
-            "times worse"
-        )
-    lines.append(f"  {found.ambiguity}")
-    if found.options:
-        lines.append(f"  To read it this way: nerfcli ct convert IN SCAN {found.options}")
-    return lines
 
 
 @command
@@ -155,9 +106,10 @@ def doctor(
 ) -> None:
     """Check a scan for problems before the reconstruction.
 
-    Checks I > I0, drift, rings, counts, truncation, missing directions, the centre of rotation and beam hardening.
-    Prints a table on stderr and writes a page with the sinogram next to the scan, SCAN-doctor.html. Each finding is
-    good, look or bad, with its number, its threshold and advice.
+    Checks I > I0, drift, rings, counts, truncation, missing directions, the side that columns are numbered from, the
+    direction and the centre of rotation, and beam hardening. Prints a table on stderr and writes a page with the
+    sinogram next to the scan, SCAN-doctor.html. Each finding is good, look or bad, with its number, its threshold and
+    advice.
 
     \b
     Examples:

@@ -62,7 +62,7 @@ def read_skyscan(path: Path) -> ReaderOutput:
     if fields.number("Postalignment", 0.0) != 0:
         notes.append(
             f"the log has a postalignment of {fields.number('Postalignment'):g} pixels, which is ignored: "
-            "--detect estimates the centre of rotation"
+            "ct doctor and ct train estimate the centre of rotation"
         )
     white = _white(fields, values, notes)
     return ReaderOutput(path, "skyscan", values / white, "transmission", circle, "mm", notes=notes)
