@@ -1,4 +1,4 @@
-"""Line integrals through voxels: against closed forms, their transpose, their gradients, and the compiled kernels."""
+"""Line integrals through voxels: against closed forms, their transpose, and the compiled kernels."""
 
 import numpy as np
 import pytest
@@ -102,29 +102,17 @@ def test_transpose_is_the_transpose(count: int, seed: int, exponent: int) -> Non
     torch.testing.assert_close(forward, backward, rtol=1e-10, atol=1e-10 * 10.0**exponent)
 
 
-def test_gradients_in_volume_and_rays(generator: torch.Generator) -> None:
-    origins, directions = (x[:12].clone().requires_grad_() for x in lines(40, generator))
-    volume = torch.randn((4, 3, 5), generator=generator, dtype=torch.float64).requires_grad_()
-    at = {"first": (-1.0, -0.5, -0.7), "size": 0.5}
-    assert torch.autograd.gradcheck(lambda v: reference.project(v, origins.detach(), directions.detach(), **at), volume)
-    generic = torch.tensor([[0.11, 0.05, 0.03], [0.2, -0.13, 0.21]], dtype=torch.float64).requires_grad_()
-    along = torch.tensor([[1.0, 0.21, 0.17], [0.13, 0.12, -1.0]], dtype=torch.float64).requires_grad_()
-    assert torch.autograd.gradcheck(lambda o, d: reference.project(volume.detach(), o, d, **at), (generic, along))
-
-
 @pytest.mark.parametrize("count", [0, 1, 5, 123, 2000])
-def test_compiled_kernels_agree_in_value_and_gradient(count: int, generator: torch.Generator) -> None:
+def test_compiled_kernels_agree(count: int, generator: torch.Generator) -> None:
     origins, directions = lines(count, generator)
     volume = torch.randn(SHAPE, generator=generator)
     values = torch.randn(count, generator=generator)
-    leaf = volume.clone().requires_grad_()
-    found = numba_cpu.project(leaf, origins, directions, **GRID)
+    found = numba_cpu.project(volume, origins, directions, **GRID)
     expected = reference.project(volume.double(), origins, directions, **GRID)
     torch.testing.assert_close(found.double(), expected, rtol=0, atol=5e-6)
-    (found * values).sum().backward()
+    spread = numba_cpu.back_project(values, origins, directions, shape=SHAPE, **GRID)
     transposed = reference.back_project(values.double(), origins, directions, shape=SHAPE, **GRID)
-    assert leaf.grad is not None
-    torch.testing.assert_close(leaf.grad.double(), transposed, rtol=0, atol=5e-5)
+    torch.testing.assert_close(spread.double(), transposed, rtol=0, atol=5e-5)
 
 
 def test_back_projection_has_the_same_bits_with_one_and_two_threads(generator: torch.Generator) -> None:

@@ -126,8 +126,12 @@ def _back_project(values: Any, origins: Any, directions: Any, first: Any, size: 
 def project(
     volume: Tensor, origins: Tensor, directions: Tensor, *, first: tuple[float, float, float], size: float
 ) -> Tensor:
-    """See `reference.project`; a float32 volume, lines in float64. Differentiable in the volume alone."""
-    return _Project.apply(volume, origins, directions, first, size)
+    """See `reference.project`; a float32 volume, lines in float64. No gradients: see `back_project`."""
+    use_threads()
+    out = np.empty(len(origins), dtype=np.float32)
+    lines_and_grid = _arguments(origins, directions, first, size, tuple(volume.shape))
+    _project(volume.detach().contiguous().view(-1).numpy(), *lines_and_grid, out)
+    return torch.from_numpy(out)
 
 
 def back_project(
@@ -152,23 +156,6 @@ def _arguments(
     """Return lines and grid as the loops take them."""
     lines = origins.contiguous().numpy(), directions.contiguous().numpy()
     return *lines, np.array(first, dtype=np.float64), float(size), np.array(shape[::-1])
-
-
-class _Project(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, volume: Tensor, origins: Tensor, directions: Tensor, first: Any, size: float) -> Tensor:
-        use_threads()
-        ctx.save_for_backward(origins, directions)
-        ctx.grid = {"shape": tuple(volume.shape), "first": first, "size": size}
-        out = np.empty(len(origins), dtype=np.float32)
-        lines_and_grid = _arguments(origins, directions, first, size, tuple(volume.shape))
-        _project(volume.detach().contiguous().view(-1).numpy(), *lines_and_grid, out)
-        return torch.from_numpy(out)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Any:  # type: ignore[override]
-        origins, directions = ctx.saved_tensors
-        return back_project(gradient, origins, directions, **ctx.grid), None, None, None, None
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")

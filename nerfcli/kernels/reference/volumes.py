@@ -25,8 +25,7 @@ def project(
         size: side of a voxel.
 
     Returns:
-        (R,), in units of the volume times `size`. Differentiable in the volume, and in origins and directions where
-        neither a plane's cell nor the axis changes.
+        (R,), in units of the volume times `size`.
 
     Source: Joseph 1982, An improved algorithm for reprojecting rays through pixel images, IEEE TMI 1(3).
     """

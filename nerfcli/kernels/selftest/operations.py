@@ -374,19 +374,12 @@ def volume_inputs(thickness: float, precision: Precision) -> Inputs:
 
 
 def project(module: ModuleType, given: Inputs) -> Outcome:
-    """Compute line integrals and their transpose, both as the gradient and as a separate operation."""
-    volume, lines = given["volume"].detach().requires_grad_(), (given["origins"], given["directions"])
-    grid = {"first": cases.VOLUME_FIRST, "size": cases.VOXEL}
-    integrals = module.project(volume, *lines, **grid)
-    (gradient,) = torch.autograd.grad((integrals * given["gains"]).sum(), volume)
+    """Compute line integrals and their transpose."""
+    lines, grid = (given["origins"], given["directions"]), {"first": cases.VOLUME_FIRST, "size": cases.VOXEL}
+    integrals = module.project(given["volume"], *lines, **grid)
     back = module.back_project(given["gains"], *lines, shape=cases.VOLUME_SHAPE, **grid)
-    largest = gradient.abs().max().expand_as(gradient)
-    return Outcome(
-        {"integrals": integrals.detach(), "transpose": back},
-        {"by volume": gradient},
-        {"by volume": largest},
-        {"transpose": largest},
-    )
+    sizes = {"transpose": back.abs().max().expand_as(back)}
+    return Outcome({"integrals": integrals, "transpose": back}, value_sizes=sizes)
 
 
 def project_in_single(given: Inputs) -> Outcome:

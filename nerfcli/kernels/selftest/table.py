@@ -246,7 +246,7 @@ def volume_check(thickness: float) -> Check:
         "project",
         partial(operations.volume_inputs, thickness),
         operations.project,
-        lambda precision: operations.both(4 if precision.compiled else 4 * planes + 4, precision),
+        lambda precision: Errors((4 if precision.compiled else 4 * planes + 4) * precision.unit),
         "(4 n + 4) u: sums over n planes of 4 voxels, all positive; compiled 4 u: sums in float64",
         (SINGLE, COMPILED),
         formula="lines in float32",
