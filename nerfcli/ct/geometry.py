@@ -255,11 +255,6 @@ class Circle:
         geometry = geometry.shifted(self.column_shift, self.row_shift).tilted(self.tilt)
         return geometry.mirrored() if self.mirrored else geometry
 
-    def scaled(self, factor: float) -> "Circle":
-        """Return the same scan in a unit that is `factor` times smaller."""
-        lengths = ("pixel_width", "pixel_height", "source_origin", "source_detector", "lateral")
-        return replace(self, **{name: factor * getattr(self, name) for name in lengths})
-
 
 def circle_of(geometry: ScanGeometry) -> tuple[Circle, float]:
     """Fit a circle to a geometry; also return its distance from the geometry.

@@ -1,14 +1,14 @@
 """Build a scan from the output of a reader and the user's options: check values, mark dead pixels."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from nerfcli.captures.holdout import names_held_out
-from nerfcli.ct.formats.statement import MILLIMETRES, ScanOptions, check_pixel_size
+from nerfcli.ct.formats.statement import MILLIMETRES, ScanOptions
 from nerfcli.ct.geometry import Circle, ScanGeometry
 from nerfcli.ct.open_beam import OpenBeam
 from nerfcli.ct.scan import Kind, Scan, held_out_views
@@ -18,6 +18,8 @@ from nerfcli.errors import UserError, several
 LEAST_FINITE = 0.5
 # Largest plausible transmission, and largest line integral that a detector can measure.
 MOST_TRANSMISSION, MOST_INTEGRAL = 3.0, 30.0
+# Range of plausible pixel sides in mm; outside of it, the unit must be wrong.
+PIXEL_MM = (1e-6, 20.0)
 UNKNOWN_UNIT = "unit"
 _EMPTY = "the projections are empty: export them again"
 
@@ -32,15 +34,14 @@ class ReaderOutput:
         values: (V, rows, columns).
         kind: type of the values.
         geometry: a circle where the format states one, else vectors.
-        unit: unit of lengths, such as "mm" or `UNKNOWN_UNIT`.
+        unit: unit of lengths of the scan, such as "mm" or `UNKNOWN_UNIT`.
         beam: the open beam, for counts.
         photons: number of photons per pixel of the open beam, if stated.
         held_out: views that the format holds out; None if it does not state any.
         names: names of the views, for error messages.
         notes: notes for the user.
         history: further entries for `Scan.history`.
-        stated_mm: millimetres per unit of length in the file, already applied; 1 if the file states no unit, None if it
-            states no lengths.
+        mm: millimetres per unit of length of `geometry`; 1 if the file states no unit, None if it states no lengths.
     """
 
     path: Path
@@ -55,7 +56,7 @@ class ReaderOutput:
     names: Sequence[str] = ()
     notes: Sequence[str] = ()
     history: Mapping[str, Any] | None = None
-    stated_mm: float | None = 1.0
+    mm: float | None = 1.0
 
 
 def scan_of(found: ReaderOutput, given: ScanOptions) -> Scan:
@@ -66,16 +67,17 @@ def scan_of(found: ReaderOutput, given: ScanOptions) -> Scan:
     """
     notes = list(found.notes)
     values = _checked(found)
-    unit, placed = _in_millimetres(found, given)
-    if given.mirrored:
-        placed = replace(placed, mirrored=not placed.mirrored) if isinstance(placed, Circle) else placed.mirrored()
+    unit, scale = _unit(found, given)
     try:
         with np.errstate(over="raise", divide="raise", invalid="raise"):
-            geometry = placed.geometry() if isinstance(placed, Circle) else placed
+            placed = found.geometry.geometry() if isinstance(found.geometry, Circle) else found.geometry
+            geometry = placed.scaled(scale)
     except FloatingPointError as error:
         raise UserError(
             f"{found.path}: distances or sizes are too large or too small", "correct the numbers or their unit"
         ) from error
+    if given.mirrored:
+        geometry = geometry.mirrored()
     if values.shape != (geometry.views, geometry.rows, geometry.columns):
         views, rows, columns = values.shape
         raise UserError(
@@ -83,11 +85,14 @@ def scan_of(found: ReaderOutput, given: ScanOptions) -> Scan:
             f"detector of {geometry.columns} x {geometry.rows}",
             "projections, angles and detector size of one scan belong together: check that no file is missing",
         )
-    if unit == "mm":
-        check_pixel_size(float(np.linalg.norm(geometry.column_step[0])), where=str(found.path))
+    pixel = float(np.linalg.norm(geometry.column_step[0]))
+    if unit == "mm" and not PIXEL_MM[0] <= pixel <= PIXEL_MM[1]:
+        raise UserError(
+            f"{found.path}: a pixel of {pixel:g} mm",
+            f"between {PIXEL_MM[0]:g} and {PIXEL_MM[1]:g} mm are possible; set the unit of lengths with --unit",
+        )
     if given.centre_column is not None:
-        placed = moved = _with_centre(placed, geometry, given.centre_column)
-        geometry = moved.geometry() if isinstance(moved, Circle) else moved
+        geometry = _with_centre(geometry, given.centre_column)
     values, usable = _usable(found, values, notes)
     photons = _photons(found, given)
     history = {
@@ -143,34 +148,30 @@ def _checked(found: ReaderOutput) -> np.ndarray:
     return values
 
 
-def _in_millimetres(found: ReaderOutput, given: ScanOptions) -> tuple[str, Circle | ScanGeometry]:
-    """Return the unit of lengths, and the geometry in that unit; it is mm if the user gave a unit."""
+def _unit(found: ReaderOutput, given: ScanOptions) -> tuple[str, float]:
+    """Return the scan's unit of lengths, mm if the user gave one, and the factor on those of the reader's geometry."""
     if given.unit is None:
-        return found.unit, found.geometry
+        return found.unit, found.mm or 1.0
     factor = MILLIMETRES.get(given.unit)
     if factor is None:
         raise UserError(
             f"--unit {given.unit} is not a unit of length", f"choose one of {', '.join(sorted(MILLIMETRES))}"
         )
-    if found.stated_mm is None:
+    if found.mm is None:
         raise UserError(
             f"{found.path} states no pixel size, to which --unit {given.unit} would apply",
             "store the size in the file as x_pixel_size, or leave out --unit: lengths are then in pixels",
         )
-    return "mm", found.geometry.scaled(factor / found.stated_mm)
+    return "mm", factor
 
 
-def _with_centre(placed: Circle | ScanGeometry, geometry: ScanGeometry, column: float) -> Circle | ScanGeometry:
+def _with_centre(geometry: ScanGeometry, column: float) -> ScanGeometry:
     if not -geometry.columns < column < 2 * geometry.columns:
         raise UserError(
             f"--centre-of-rotation {column:g} is far outside the {geometry.columns} columns",
             "give the column that the axis is projected to, 0 for the first pixel's centre",
         )
-    moved = axis_column(geometry) - column
-    if isinstance(placed, Circle):
-        sign = -1 if placed.mirrored else 1
-        return replace(placed, column_shift=placed.column_shift + sign * moved)
-    return placed.shifted(moved)
+    return geometry.shifted(axis_column(geometry) - column)
 
 
 def axis_column(geometry: ScanGeometry) -> float:

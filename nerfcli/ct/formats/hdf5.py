@@ -34,7 +34,7 @@ def read_data_exchange(path: Path) -> ReaderOutput:
         angles = angles_in_radians(theta[...], views=len(data), unit=_unit(theta), where=f"{path}: exchange/theta")
         flats = _frames(file, "exchange/data_white", path) if "exchange/data_white" in file else None
         darks = _frames(file, "exchange/data_dark", path) if "exchange/data_dark" in file else None
-        sides = _pixel_mm(file, path)
+        sides = _pixel_size(file, path)
     return _parallel(path, "data-exchange", data, angles, flats=flats, darks=darks, sides=sides)
 
 
@@ -56,7 +56,7 @@ def read_nxtomo(path: Path) -> ReaderOutput:
         control = [name for name in datasets_in(file) if name.endswith("image_key_control")]
         # Frames for alignment have key 0 and a control of -1.
         aligned = np.asarray(file[control[0]][...]).reshape(-1) < 0 if control else np.zeros(len(key), bool)
-        sides = _pixel_mm(file, path)
+        sides = _pixel_size(file, path)
     chosen = (key == _PROJECTION) & ~aligned if len(aligned) == len(key) else key == _PROJECTION
     if not chosen.any():
         raise UserError(f"{path}: no frame has image_key 0", "projections have the key 0, flats 1, darks 2")
@@ -84,7 +84,7 @@ def _parallel(
 ) -> ReaderOutput:
     check_sizes(data.shape, flats=flats, darks=darks, path=path)
     notes = ["the file does not say which way the source moved: counter-clockwise around the object is assumed"]
-    width, height, stated = (1.0, 1.0, None) if sides is None else sides
+    width, height, mm = (1.0, 1.0, None) if sides is None else sides
     circle = Circle("parallel", tuple(angles.tolist()), width, height, data.shape[1], data.shape[2])
     if sides is None:
         notes.append("the file does not state the pixel size: lengths are in pixels")
@@ -100,7 +100,7 @@ def _parallel(
         beam = open_beam_of(flats, darks)
     kind = "transmission" if beam is None else "counts"
     unit = "voxel" if sides is None else "mm"
-    return ReaderOutput(path, form, data, kind, circle, unit, beam=beam, notes=notes, stated_mm=stated)
+    return ReaderOutput(path, form, data, kind, circle, unit, beam=beam, notes=notes, mm=mm)
 
 
 def _dataset(file: Any, name: str, path: Path, what: str) -> Any:
@@ -139,8 +139,8 @@ def _unit(dataset: Any) -> str | None:
     return None
 
 
-def _pixel_mm(file: Any, path: Path) -> tuple[float, float, float] | None:
-    """Return width and height of a pixel in mm, and the mm per unit of the width; None if the file has no size."""
+def _pixel_size(file: Any, path: Path) -> tuple[float, float, float] | None:
+    """Return width and height of a pixel in the unit of the width, and that unit in mm; None if no size is stated."""
     names = {found.rpartition("/")[2]: found for found in datasets_in(file)}
     width = next((names[name] for name in _PIXEL_WIDTH if name in names), None)
     if width is None:
@@ -149,9 +149,8 @@ def _pixel_mm(file: Any, path: Path) -> tuple[float, float, float] | None:
     sides, units = [], []
     for name in (width, height):
         value = np.asarray(file[name][...]).reshape(-1)
-        unit = _unit(file[name]) or "m"  # the unit of NeXus
         if len(value) == 0 or not np.issubdtype(value.dtype, np.number):
             return None
-        units.append(millimetres(unit, where=f"{path}: {name}"))
-        sides.append(float(value[0]) * units[-1])
-    return sides[0], sides[1], units[0]
+        sides.append(float(value[0]))
+        units.append(millimetres(_unit(file[name]) or "m", where=f"{path}: {name}"))  # metres are the unit of NeXus
+    return sides[0], sides[1] * (units[1] / units[0]), units[0]

@@ -36,13 +36,11 @@ def read_heltomo(path: Path) -> ReaderOutput:
             f"{path}: {columns} columns, but numDetectorsPost is {stated}",
             "the sinogram was cropped: correct one of them",
         )
-    pixel = unit * fields.positive("pixelSizePost")
-    origin, detector = (unit * fields.positive(f"distanceSource{to}") for to in ("Origin", "Detector"))
+    pixel = fields.positive("pixelSizePost")
+    origin, detector = (fields.positive(f"distanceSource{to}") for to in ("Origin", "Detector"))
     circle = Circle("cone", tuple((angles - np.pi / 2).tolist()), pixel, pixel, 1, columns, origin, detector)
     history = {"project": fields.text("projectName", path.stem)}
-    return ReaderOutput(
-        *(path, "heltomo", sinogram[:, None], "line_integral", circle, "mm"), history=history, stated_mm=unit
-    )
+    return ReaderOutput(*(path, "heltomo", sinogram[:, None], "line_integral", circle, "mm"), history=history, mm=unit)
 
 
 def _struct(path: Path) -> tuple[str, Any]:

@@ -60,16 +60,16 @@ def read_stated_stack(path: Path) -> ReaderOutput:
     views, rows, columns = values.shape
     factor = millimetres(fields.text("unit"), where=f"{file}: unit")
     if "vectors" in fields:
-        geometry: Circle | ScanGeometry = _vectors(fields, beam, factor, rows=rows, columns=columns)
+        geometry: Circle | ScanGeometry = _vectors(fields, beam, rows=rows, columns=columns)
     else:
-        geometry = _circle(fields, beam, views=views, rows=rows, columns=columns).scaled(factor)
+        geometry = _circle(fields, beam, views=views, rows=rows, columns=columns)
     return ReaderOutput(
         *(path, "stack", values, kind, geometry, "mm"),
         beam=_open_beam(file, fields, values.shape) if kind == "counts" else None,
         photons=fields.positive("photons") if "photons" in fields else None,
         held_out=_held_out(fields, views),
         history=_truth(fields, factor),
-        stated_mm=factor,
+        mm=factor,
     )
 
 
@@ -109,13 +109,9 @@ def _circle(fields: Statement, beam: Beam, *, views: int, rows: int, columns: in
     )
 
 
-def _vectors(fields: Statement, beam: Beam, factor: float, *, rows: int, columns: int) -> ScanGeometry:
+def _vectors(fields: Statement, beam: Beam, *, rows: int, columns: int) -> ScanGeometry:
     try:
-        vectors = np.asarray(fields.value("vectors"), dtype=np.float64)
-        scale = np.full(12, factor)
-        if beam == "parallel":
-            scale[:3] = 1
-        return from_vectors(beam, vectors * scale, rows=rows, columns=columns)
+        return from_vectors(beam, fields.value("vectors"), rows=rows, columns=columns)
     except (TypeError, ValueError) as error:
         raise UserError(f"{fields.path}: vectors: {error}", "give 12 numbers per view, as ASTRA's cone_vec") from error
 

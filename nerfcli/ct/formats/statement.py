@@ -21,8 +21,6 @@ MILLIMETRES = {
     **dict.fromkeys(("um", "µm", "μm", "micron", "microns", "micrometre", "micrometer", "micrometers"), 1e-3),
     **dict.fromkeys(("nm", "nanometre", "nanometer"), 1e-6),
 }
-# Range of plausible pixel sides in mm; outside of it, the unit must be wrong.
-PIXEL_MM = (1e-6, 20.0)
 _DEGREES = ("deg", "degree", "degrees", "°", "degs")
 _RADIANS = ("rad", "radian", "radians")
 # Angles said to be in degrees that span less than this over many views are in radians.
@@ -97,19 +95,6 @@ def angles_in_radians(angles: np.ndarray, *, views: int, unit: str | None, where
             "these look like radians: correct their unit in the file",
         )
     return np.radians(values)
-
-
-def check_pixel_size(size_mm: float, *, where: str) -> None:
-    """Raise if the pixel size is impossible for a detector.
-
-    Raises:
-        UserError: the size is not positive, or its unit cannot be right.
-    """
-    if not np.isfinite(size_mm) or not PIXEL_MM[0] <= size_mm <= PIXEL_MM[1]:
-        raise UserError(
-            f"{where}: a pixel of {size_mm:g} mm",
-            f"between {PIXEL_MM[0]:g} and {PIXEL_MM[1]:g} mm are possible; set the unit of lengths with --unit",
-        )
 
 
 class Statement:
