@@ -10,7 +10,7 @@ from nerfcli.ct.centre import FEWEST_VIEWS, FINE, SIGNIFICANT, Centre, centre_of
 from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.marks import WEDGE_DEG, missing_wedge_deg
 from nerfcli.ct.open_beam import MEDIAN_DEVIATION
-from nerfcli.ct.quick import Row, highest_contrast_row, predicted, reconstructed
+from nerfcli.ct.quick import Row, grid_of_row, highest_contrast_row, predicted, reconstructed
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import several
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, finding, verdict_above, verdict_below, worst
@@ -303,9 +303,9 @@ def beam_hardening(sample: Sample) -> Finding | str:
     if len(sample.scan.live_views) < FEWEST_VIEWS:
         return "too few views"
     row = sample.row.binned(FINE)
-    volume, grid = reconstructed(row)
-    inside = volume > threshold_otsu(volume)
-    lengths = predicted(inside.astype(np.float32), row, grid)
+    grid = grid_of_row(row)
+    volume = reconstructed(row, grid)
+    lengths = predicted((volume > threshold_otsu(volume.numpy())).float(), grid, row)
     longest = float(np.quantile(lengths, 0.999))
     used = lengths > 0.1 * longest
     if longest <= 0 or used.sum() < 100:

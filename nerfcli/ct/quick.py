@@ -40,11 +40,14 @@ class Row:
         means = self.integrals[:, : kept * factor].reshape(len(self.integrals), kept, factor).mean(2)
         return Row(self.geometry.binned(factor), means)
 
+    def select(self, views: np.ndarray) -> "Row":
+        """Return the row with some of its views, given by their indices."""
+        return Row(self.geometry.select(views), self.integrals[views])
+
     def thinned(self) -> "Row":
         """Return the row with at most `MOST_VIEWS` views, at equal steps."""
         views = len(self.integrals)
-        index = np.unique(np.linspace(0, views - 1, min(MOST_VIEWS, views)).round().astype(int))
-        return Row(self.geometry.select(index), self.integrals[index])
+        return self.select(np.unique(np.linspace(0, views - 1, min(MOST_VIEWS, views)).round().astype(int)))
 
 
 def highest_contrast_row(scan: Scan, views: np.ndarray | None = None) -> Row:
@@ -80,30 +83,21 @@ def misfit(row: Row, *, shift: float = 0.0, mirrored: bool = False) -> np.ndarra
         mirrored: whether its columns are read from the other side.
     """
     geometry = row.geometry.mirrored() if mirrored else row.geometry
-    geometry = geometry.shifted(shift)
-    views = np.arange(geometry.views)
-    fitted, left = views[::2], views[1::2]
-    grid = _grid(geometry)
-    volume = _reconstructed(geometry.select(fitted), row.integrals[fitted], grid)
-    others = Projector(geometry.select(left), grid).forward(volume).numpy()
-    return ((others - row.integrals[left]) ** 2).mean(1)
+    views, moved = np.arange(geometry.views), replace(row, geometry=geometry.shifted(shift))
+    grid, others = grid_of_row(moved), moved.select(views[1::2])
+    volume = reconstructed(moved.select(views[::2]), grid)
+    return ((predicted(volume, grid, others) - others.integrals) ** 2).mean(1)
 
 
-def predicted(volume: np.ndarray, row: Row, grid: VoxelGrid) -> np.ndarray:
-    """Return line integrals (V, columns) of a volume (Y, X) along the rays of a row."""
-    return Projector(row.geometry, grid).forward(torch.from_numpy(volume[None])).numpy()
+def predicted(volume: Tensor, grid: VoxelGrid, row: Row) -> np.ndarray:
+    """Return line integrals (V, columns) of a volume (1, Y, X) along the rays of a row."""
+    return Projector(row.geometry, grid).forward(volume).numpy()
 
 
-def reconstructed(row: Row) -> tuple[np.ndarray, VoxelGrid]:
-    """Return a quick reconstruction from all views, (Y, X), and its grid."""
-    grid = _grid(row.geometry)
-    return _reconstructed(row.geometry, row.integrals, grid)[0].numpy(), grid
-
-
-def _reconstructed(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGrid) -> Tensor:
-    """Reconstruct a volume (1, Y, X) by SIRT with positivity and Nesterov's momentum."""
-    measured = torch.from_numpy(np.ascontiguousarray(integrals, dtype=np.float32))
-    projector = Projector(geometry, grid)
+def reconstructed(row: Row, grid: VoxelGrid) -> Tensor:
+    """Return a volume (1, Y, X), by SIRT with positivity and Nesterov's momentum."""
+    measured = torch.from_numpy(np.ascontiguousarray(row.integrals, dtype=np.float32))
+    projector = Projector(row.geometry, grid)
     chord = projector.forward(torch.ones(grid.shape))
     by_ray = torch.where(chord > grid.size, 1 / chord.clamp_min(grid.size), 0)
     met = projector.backward(torch.ones_like(chord))
@@ -119,10 +113,10 @@ def _reconstructed(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGri
     return volume
 
 
-def _grid(geometry: ScanGeometry) -> VoxelGrid:
+def grid_of_row(row: Row) -> VoxelGrid:
     """Return a square grid around the circle that the outermost ray touches, with voxels of a pixel's size."""
-    _, width = geometry.pixel_at_origin
-    origins, directions = geometry.rays()
+    _, width = row.geometry.pixel_at_origin
+    origins, directions = row.geometry.rays()
     across = np.abs(origins[..., 0] * directions[..., 1] - origins[..., 1] * directions[..., 0]).max()
     count = 2 * int(np.ceil(float(across) / width)) + 1
     edge = -(count - 1) / 2 * width
