@@ -11,7 +11,7 @@ from pathlib import Path
 import typer
 
 from nerfcli.cli.console import out_of_memory_explained, report_error
-from nerfcli.ct.recognise import OWN, is_reconstruction, is_volume, recognise
+from nerfcli.ct.recognise import OWN, is_reconstruction, recognise
 from nerfcli.errors import UserError, in_shell
 from nerfcli.machine import return_freed_memory
 
@@ -21,15 +21,13 @@ _OF_RUNS = ("render", "evaluate", "export", "info")
 
 
 def refuse_scan(path: Path, command: str) -> None:
-    """Refuse a scan, its reconstruction or its volume in a command for photos.
+    """Refuse a scan or its reconstruction in a command for photos.
 
     Raises:
         UserError: the path is one; the hint is the command line for it.
     """
     if is_reconstruction(path):
         what, commands = "the reconstruction of an X-ray scan", _OF_RUNS
-    elif command == "info" and is_volume(path):
-        what, commands = "the volume of an X-ray scan", ("info",)
     elif (form := recognise(path)) is not None:
         what, commands = ("an X-ray scan", _OF_SCANS) if form == OWN else (f"an X-ray scan ({form})", _OF_FORMATS)
     else:

@@ -1,4 +1,4 @@
-"""Describe scans, reconstructions and volumes as plain values."""
+"""Describe scans and reconstructions as plain values."""
 
 from pathlib import Path
 from typing import Any
@@ -8,23 +8,19 @@ import numpy as np
 from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.formats.read import read_scan
 from nerfcli.ct.geometry import circle_of
-from nerfcli.ct.recognise import is_reconstruction, is_volume
+from nerfcli.ct.recognise import is_reconstruction
 from nerfcli.ct.result import load_reconstruction
 from nerfcli.ct.scan import MEASUREMENT, Scan
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Describe a reconstruction, a volume's file, or a scan in a supported format.
+    """Describe a reconstruction, or a scan in a supported format.
 
     Raises:
-        UserError: the path is none of these, or damaged.
+        UserError: the path is neither, or damaged.
     """
     if is_reconstruction(path):
         return _describe_reconstruction(path)
-    if is_volume(path):
-        from nerfcli.ct.export import volume_facts
-
-        return volume_facts(path)
     scan = read_scan(path)
     return {"kind": "scan", **facts_of(scan), "notes": list(scan.history.get("notes", ()))}
 

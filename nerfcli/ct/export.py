@@ -4,13 +4,12 @@ All are float32 (or uint8 for marks), little-endian, x fastest, with spacing, or
 is that of the scan: x and y across the rotation axis, z along it.
 """
 
+import gzip
 import json
 import struct
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tifffile
@@ -38,8 +37,8 @@ class VolumeFile:
     Args:
         values: (Z, Y, X).
         grid: position and size of the voxels.
-        unit: unit of lengths; "" if the file does not state it.
-        quantity: unit of the values, such as "1/mm"; "" if the file does not state it.
+        unit: unit of lengths.
+        quantity: unit of the values, such as "1/mm".
     """
 
     values: np.ndarray
@@ -98,49 +97,10 @@ def write_volume(path: Path, volume: VolumeFile) -> None:
     """
     if volume.values.dtype not in _WORDS:
         raise ValueError(f"volumes are float32 or uint8, not {volume.values.dtype}")
-    if path.suffix.lower() not in _FORMATS:
+    if path.suffix.lower() not in _WRITERS:
         raise UserError(f"{path.name}: unknown volume format", f"choose one of {', '.join(VOLUMES)}")
     with atomic_path(path) as partial:
-        _FORMATS[path.suffix.lower()][0](partial, volume)
-
-
-def read_volume(path: Path) -> VolumeFile:
-    """Read what `write_volume` wrote.
-
-    Raises:
-        UserError: it is missing, damaged, or was not written by nerfcli.
-    """
-    try:
-        return _FORMATS[path.suffix.lower()][1](path)
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or error}", "give a volume file") from error
-    except (KeyError, ValueError, IndexError, struct.error, zlib.error) as error:
-        raise UserError(
-            f"{path} is damaged or not a volume written by nerfcli: {error}", "export the volume again"
-        ) from error
-
-
-def volume_facts(path: Path) -> dict[str, Any]:
-    """Return the facts about a volume's file by name.
-
-    Raises:
-        UserError: see `read_volume`.
-    """
-    volume = read_volume(path)
-    values, grid = volume.values, volume.grid
-    known = values[np.isfinite(values)] if values.dtype.kind == "f" else values
-    span = f", {known.min():.6g} to {known.max():.6g}" if known.size else ", no numbers"
-    return {
-        "unit": volume.unit,
-        "quantity": volume.quantity,
-        "kind": "volume",
-        "format": path.suffix[1:].upper(),
-        "voxel_size": grid.size,
-        "voxels": "x".join(map(str, reversed(grid.shape))),
-        "first_centre": list(grid.first),
-        "last_centre": [float(grid.axis(name)[-1]) for name in "xyz"],
-        _name_of(volume): f"{values.dtype}{span}, {100 * known.size / values.size:.1f} % known",
-    }
+        _WRITERS[path.suffix.lower()](partial, volume)
 
 
 def _name_of(volume: VolumeFile) -> str:
@@ -173,24 +133,7 @@ def _write_nrrd(path: Path, volume: VolumeFile) -> None:
         "",
         "",
     ]
-    packed = zlib.compressobj(6, zlib.DEFLATED, 31)
-    body = packed.compress(np.ascontiguousarray(volume.values).tobytes()) + packed.flush()
-    path.write_bytes("\n".join(lines).encode("ascii") + body)
-
-
-def _read_nrrd(path: Path) -> VolumeFile:
-    head, _, body = path.read_bytes().partition(b"\n\n")
-    fields = {}
-    for line in head.decode("utf-8", errors="replace").splitlines()[1:]:
-        name, _, value = line.partition(":")
-        fields[name] = value.removeprefix("=").strip()
-    stated = json.loads(fields["nerfcli"])
-    kind = {word: kind for kind, word in _NRRD_TYPES.items()}[fields["type"]]
-    shape = tuple(int(count) for count in reversed(fields["sizes"].split()))
-    values = np.frombuffer(zlib.decompress(body, 31), kind).reshape(shape)
-    first = [float(v) for v in fields["space origin"].strip("()").split(",")]
-    size = float(fields["space directions"].split(",")[0].strip("("))
-    return VolumeFile(values, VoxelGrid.of(shape, first, size), stated["unit"], stated["quantity"])
+    path.write_bytes("\n".join(lines).encode("ascii") + gzip.compress(volume.values.tobytes(), 6, mtime=0))
 
 
 def _write_mha(path: Path, volume: VolumeFile) -> None:
@@ -211,19 +154,6 @@ def _write_mha(path: Path, volume: VolumeFile) -> None:
         "ElementDataFile = LOCAL",
     ]
     path.write_bytes(("\n".join(lines) + "\n").encode("ascii") + volume.values.tobytes())
-
-
-def _read_mha(path: Path) -> VolumeFile:
-    content = path.read_bytes()
-    end = b"ElementDataFile = LOCAL\n"
-    at = content.index(end) + len(end)
-    fields = dict(line.split(" = ", 1) for line in content[:at].decode("ascii").splitlines())
-    kind = {"MET_UCHAR": np.dtype(np.uint8), "MET_FLOAT": np.dtype("<f4")}[fields["ElementType"]]
-    x, y, z = (int(n) for n in fields["DimSize"].split())
-    first = [float(v) for v in fields["Offset"].split()]
-    values = np.frombuffer(content[at:], kind).reshape(z, y, x)
-    grid = VoxelGrid.of(values.shape, first, float(fields["ElementSpacing"].split()[0]))
-    return VolumeFile(values, grid, *_stated_units(fields["Comment"]))
 
 
 def _write_nifti(path: Path, volume: VolumeFile) -> None:
@@ -247,18 +177,6 @@ def _write_nifti(path: Path, volume: VolumeFile) -> None:
     path.write_bytes(header + volume.values.tobytes())
 
 
-def _read_nifti(path: Path) -> VolumeFile:
-    content = path.read_bytes()
-    if struct.unpack_from("<i", content, 0)[0] != 348 or content[344:347] != b"n+1":
-        raise ValueError("it has no header of NIfTI-1")
-    x, y, z = struct.unpack_from("<3h", content, 42)
-    kind = {2: np.dtype(np.uint8), 16: np.dtype("<f4")}[struct.unpack_from("<h", content, 70)[0]]
-    rows = [struct.unpack_from("<4f", content, 280 + 16 * row) for row in range(3)]
-    values = np.frombuffer(content[_NIFTI_HEADER:], kind).reshape(z, y, x)
-    grid = VoxelGrid.of(values.shape, [row[3] for row in rows], rows[0][0])
-    return VolumeFile(values, grid, *_stated_units(content[148:228].rstrip(b"\0").decode("ascii")))
-
-
 def _write_tiff(path: Path, volume: VolumeFile) -> None:
     size, first = volume.grid.size, volume.grid.first
     tifffile.imwrite(
@@ -276,32 +194,14 @@ def _write_tiff(path: Path, volume: VolumeFile) -> None:
     )
 
 
-def _read_tiff(path: Path) -> VolumeFile:
-    with tifffile.TiffFile(path) as tiff:
-        found = tiff.imagej_metadata
-        if found is None:
-            raise ValueError("it has no description of ImageJ")
-        values = tiff.asarray()
-    values = values.reshape(-1, *values.shape[-2:])
-    first = [float(v) for v in str(found["first"]).split()]
-    grid = VoxelGrid.of(values.shape, first, float(found["spacing"]))
-    return VolumeFile(values, grid, str(found.get("unit", "")), str(found.get("quantity", "")))
-
-
 def _units(volume: VolumeFile) -> str:
     return f"unit {volume.unit or '-'} quantity {volume.quantity or '-'}"
 
 
-def _stated_units(comment: str) -> tuple[str, str]:
-    _, unit, _, quantity = comment.split(" ", 3)
-    return unit.strip("-"), quantity.strip("-")
-
-
-# Writer and reader of each suffix.
-_FORMATS: dict[str, tuple[Callable[[Path, VolumeFile], None], Callable[[Path], VolumeFile]]] = {
-    ".nrrd": (_write_nrrd, _read_nrrd),
-    ".mha": (_write_mha, _read_mha),
-    ".nii": (_write_nifti, _read_nifti),
-    ".tif": (_write_tiff, _read_tiff),
-    ".tiff": (_write_tiff, _read_tiff),
+_WRITERS: dict[str, Callable[[Path, VolumeFile], None]] = {
+    ".nrrd": _write_nrrd,
+    ".mha": _write_mha,
+    ".nii": _write_nifti,
+    ".tif": _write_tiff,
+    ".tiff": _write_tiff,
 }

@@ -1,4 +1,4 @@
-"""What a path is to the commands for scans: a scan folder, a scan in a scanner's format, a reconstruction, a volume.
+"""What a path is to the commands for scans: a scan folder, a scan in a scanner's format, or a reconstruction.
 
 Only names and the beginnings of files are read, and nothing heavy is imported but h5py for HDF5: commands for photos
 ask this before they load anything.
@@ -21,7 +21,7 @@ TRANSFORMS, TRANSFORMS_GEOMETRY = ("transforms_train.json", "transforms_test.jso
 _NAMED = {STACK: ("stack", '"projections"'), R2_GAUSSIAN: ("r2-gaussian", '"scanner"'), SCENE_FILE: (OWN, _MEASURED)}
 _SUFFIXES = {"nikon": (".xtekct", ""), "skyscan": (".log", "Object to Source")}
 _HDF5 = (".h5", ".hdf5", ".hdf", ".nxs", ".nx")
-# Suffixes of volumes, the default first. A .tif may also be a picture.
+# Suffixes of volumes, the default first.
 VOLUMES = (".nrrd", ".mha", ".nii", ".tif")
 _BEGINNING_BYTES = 2**20
 
@@ -34,14 +34,6 @@ def is_scan(path: Path) -> bool:
 def is_reconstruction(run: Path) -> bool:
     """Return whether a folder is a run that `save_reconstruction` wrote."""
     return _has(run / DESCRIPTION, _MEASURED)
-
-
-def is_volume(path: Path) -> bool:
-    """Return whether a file is an NRRD, a MetaImage or a NIfTI, or a TIFF stack that `write_volume` wrote."""
-    suffix = path.suffix.lower()
-    if suffix in (".tif", ".tiff"):
-        return _has(path, "ImageJ=", "\nspacing=", "\nfirst=")
-    return suffix in VOLUMES and os.path.isfile(path)
 
 
 def recognise(path: Path) -> str | None:

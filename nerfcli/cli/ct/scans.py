@@ -243,16 +243,15 @@ def _refuse_other_formats(path: Path) -> None:
 def info(
     path: Annotated[
         str,
-        typer.Argument(help="Scan in any format, run, or exported volume; - to read paths from standard input."),
+        typer.Argument(help="Scan in any format, or run; - to read paths from standard input."),
     ],
     json: Json = False,
 ) -> None:
-    """Show what a scan, a run or a volume contains.
+    """Show what a scan or a run contains.
 
     \b
     scan            geometry, beam, values, unit, views held out
     run             voxels, passes, what was decided by the data
-    volume          (NRRD, MHA, NIfTI, TIFF) voxels, position, unit, range of values
 
     \b
     Examples:
