@@ -20,7 +20,7 @@ def described_truth(
     first: Sequence[float] | None = None,
     dtype: str | None = None,
 ) -> dict[str, Any]:
-    """Return the entry of a scan's history from which `load_truth` loads the true volume.
+    """Return the entry "truth" of a scan's history, from which `load_truth` loads the true volume.
 
     Args:
         path: the file: a .npy, or plain numbers of type `dtype`.
@@ -31,15 +31,13 @@ def described_truth(
         first: (x, y, z) centre of the first voxel; by default, the volume is centred on the origin.
     """
     return {
-        "truth": {
-            "path": str(path.absolute()),
-            "layout": layout,
-            **({} if dtype is None else {"dtype": dtype}),
-            "shape": list(shape),
-            "first": [-(count - 1) / 2 * size for count in reversed(shape)] if first is None else list(first),
-            "size": size,
-            "attenuation_per_value": attenuation_per_value,
-        }
+        "path": str(path.absolute()),
+        "layout": layout,
+        **({} if dtype is None else {"dtype": dtype}),
+        "shape": list(shape),
+        "first": [-(count - 1) / 2 * size for count in reversed(shape)] if first is None else list(first),
+        "size": size,
+        "attenuation_per_value": attenuation_per_value,
     }
 
 

@@ -38,9 +38,8 @@ class ReaderOutput:
         beam: the open beam, for counts.
         photons: number of photons per pixel of the open beam, if stated.
         held_out: views that the format holds out; None if it does not state any.
-        names: names of the views, for error messages.
         notes: notes for the user.
-        history: further entries for `Scan.history`.
+        truth: the true volume of a simulated scan, see `described_truth`.
         mm: millimetres per unit of length of `geometry`; 1 if the file states no unit, None if it states no lengths.
     """
 
@@ -53,9 +52,8 @@ class ReaderOutput:
     beam: OpenBeam | None = None
     photons: float | None = None
     held_out: Sequence[int] | None = None
-    names: Sequence[str] = ()
     notes: Sequence[str] = ()
-    history: Mapping[str, Any] | None = None
+    truth: Mapping[str, Any] | None = None
     mm: float | None = 1.0
 
 
@@ -98,7 +96,7 @@ def scan_of(found: ReaderOutput, given: ScanOptions) -> Scan:
     history = {
         "format": found.form,
         "source": str(found.path),
-        **(found.history or {}),
+        **({} if found.truth is None else {"truth": found.truth}),
         "notes": notes,
     }
     beam = found.beam
@@ -193,7 +191,9 @@ def _usable(found: ReaderOutput, values: np.ndarray, notes: list[str]) -> tuple[
     if empty.all():
         raise UserError(f"{found.path}: all projections are empty", _EMPTY)
     if empty.any():
-        notes.append(f"{several(int(empty.sum()), 'empty projection')} left out; the first is {_named(found, empty)}")
+        notes.append(
+            f"{several(int(empty.sum()), 'empty projection')} left out; the first is number {int(np.argmax(empty))}"
+        )
     if not finite.all():
         notes.append(f"{several(int((~finite).sum()), 'non-finite value')} left out")
         neutral = {"counts": 0.0, "transmission": 1.0, "line_integral": 0.0}[found.kind]
@@ -202,11 +202,6 @@ def _usable(found: ReaderOutput, values: np.ndarray, notes: list[str]) -> tuple[
         good = finite & ~empty[:, None, None]
         usable = good if usable is None else good & usable
     return values, usable
-
-
-def _named(found: ReaderOutput, which: np.ndarray) -> str:
-    index = int(np.argmax(which))
-    return found.names[index] if index < len(found.names) else f"number {index}"
 
 
 def _photons(found: ReaderOutput, given: ScanOptions) -> float | None:

@@ -39,8 +39,7 @@ def read_heltomo(path: Path) -> ReaderOutput:
     pixel = fields.positive("pixelSizePost")
     origin, detector = (fields.positive(f"distanceSource{to}") for to in ("Origin", "Detector"))
     circle = Circle("cone", tuple((angles - np.pi / 2).tolist()), pixel, pixel, 1, columns, origin, detector)
-    history = {"project": fields.text("projectName", path.stem)}
-    return ReaderOutput(*(path, "heltomo", sinogram[:, None], "line_integral", circle, "mm"), history=history, mm=unit)
+    return ReaderOutput(path, "heltomo", sinogram[:, None], "line_integral", circle, "mm", mm=unit)
 
 
 def _struct(path: Path) -> tuple[str, Any]:

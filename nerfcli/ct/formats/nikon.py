@@ -5,14 +5,13 @@ around it; columns run from right to left seen from the source. Angles come from
 *_ctdata.txt or .ang are used instead if they agree with it to half a step, or if there is no AngularStep.
 """
 
-import glob
 import re
 from pathlib import Path
 
 import numpy as np
 
 from nerfcli.ct.formats.assemble import ReaderOutput
-from nerfcli.ct.formats.pictures import numbered, read_stack
+from nerfcli.ct.formats.pictures import read_stack, stated_projections
 from nerfcli.ct.formats.statement import Statement, angles_in_radians, read_lines
 from nerfcli.ct.geometry import Circle
 from nerfcli.errors import UserError
@@ -107,11 +106,4 @@ def _projections(path: Path, fields: Statement, views: int) -> list[Path]:
     name = fields.text("InputFolderName", "").replace("\\", "/").strip("/")
     if name and (path.parent / name).is_dir():
         folder = path.parent / name
-    stem = fields.text("Name", path.stem)
-    paths = numbered(folder, f"{glob.escape(stem)}*") or numbered(folder)
-    if len(paths) != views:
-        raise UserError(
-            f"{folder} holds {len(paths)} projections; {path.name} states {views}",
-            f"expected TIFF files named {stem}_0001.tif and so on beside the .xtekct, all of them",
-        )
-    return paths
+    return stated_projections(path, folder, fields.text("Name", path.stem), [views])

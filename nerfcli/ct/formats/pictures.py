@@ -1,5 +1,6 @@
 """Projections that are stored as pictures: numbered files, or pages of a TIFF."""
 
+import glob
 import re
 from collections.abc import Sequence
 from fnmatch import fnmatch
@@ -48,6 +49,19 @@ def numbered(folder: Path, pattern: str = "*", *, without: str | None = None) ->
             "a projection is missing; without it the angles of the others are wrong",
         )
     return [path for _, path in sorted(zip(present, paths, strict=True))]
+
+
+def stated_projections(
+    file: Path, folder: Path, stem: str, counts: Sequence[int], *, without: str | None = None
+) -> list[Path]:
+    """Return the pictures named after a stem, or else all; raise unless their number is one of `counts`, as stated."""
+    paths = numbered(folder, f"{glob.escape(stem)}*", without=without) or numbered(folder, without=without)
+    if not paths or len(paths) not in counts:
+        raise UserError(
+            f"{folder} holds {len(paths)} projections; {file.name} states {counts[0]}",
+            f"expected pictures named {stem}0001.tif and so on, all of them",
+        )
+    return paths
 
 
 def read_stack(paths: Sequence[Path]) -> np.ndarray:

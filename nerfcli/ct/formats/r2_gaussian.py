@@ -69,9 +69,8 @@ def read_r2_gaussian(path: Path) -> ReaderOutput:
     return ReaderOutput(
         *(path, "r2-gaussian", np.stack(values), "line_integral", circle, UNKNOWN_UNIT),
         held_out=held_out or None,
-        names=[str(frame.get("file_path")) for _, frame in frames],
         notes=["lengths have no unit in this format: attenuation is in 1 / its unit of length"],
-        history=_truth(meta, scanner, file),
+        truth=_truth(meta, scanner, file),
     )
 
 
@@ -86,19 +85,19 @@ def _projection(file: Path, frame: dict[str, Any]) -> np.ndarray:
     return array.astype(np.float32)
 
 
-def _truth(meta: Statement, scanner: Statement, file: Path) -> dict[str, Any]:
-    """Describe the true volume, if its file exists and its voxels are cubic; else return nothing."""
+def _truth(meta: Statement, scanner: Statement, file: Path) -> dict[str, Any] | None:
+    """Describe the true volume, if its file exists and its voxels are cubic."""
     name = meta.value("vol", meta.value("ct"))
     if not isinstance(name, str) or not (file.parent / name).is_file():
-        return {}
+        return None
     count = np.array(_numbers(scanner.value("nVoxel")))
     size = np.array(_numbers(scanner.value("sVoxel")))
     middle = np.array(_numbers(scanner.value("offOrigin", (0.0, 0.0, 0.0))))
     if not (len(count) == len(size) == len(middle) == 3):
-        return {}
+        return None
     side = size / count
     if np.ptp(side) > 1e-9 * side[0]:
-        return {}
+        return None
     shape, first = [round(n) for n in count[::-1].tolist()], (middle - (count - 1) / 2 * side).tolist()
     return described_truth(
         file.parent / name, "xyz", shape, first=first, size=float(side[0]), attenuation_per_value=1.0

@@ -4,13 +4,12 @@ The log states the pixel size at the object. "Rotation Direction=CC" turns the o
 source moves clockwise around it; columns run from right to left seen from the source, as in ASTRA's reader.
 """
 
-import glob
 from pathlib import Path
 
 import numpy as np
 
 from nerfcli.ct.formats.assemble import ReaderOutput
-from nerfcli.ct.formats.pictures import numbered, read_stack
+from nerfcli.ct.formats.pictures import read_stack, stated_projections
 from nerfcli.ct.formats.statement import Statement, angles_in_radians, read_lines
 from nerfcli.ct.geometry import Circle
 from nerfcli.errors import UserError
@@ -33,8 +32,9 @@ def read_skyscan(path: Path) -> ReaderOutput:
             f"{path}: Flat Field Correction=OFF, so the open beam is unknown",
             "correct the projections with flats in the scanner's program, or describe them in a scan.json with flats",
         )
-    paths = _projections(path, fields)
-    values = read_stack(paths)
+    count, prefix = fields.whole("Number of Files"), fields.text("Filename Prefix", path.stem)
+    # Some scanners also count a last file that repeats the first angle, which may be missing.
+    values = read_stack(stated_projections(path, path.parent, prefix, [count, count - 1], without=_OTHERS))
     views, rows, columns = values.shape
     for name, size in (("Number Of Rows", rows), ("Number Of Columns", columns)):
         if name in fields and fields.whole(name) != size:
@@ -77,16 +77,3 @@ def _white(fields: Statement, values: np.ndarray, notes: list[str]) -> float:
         raise UserError(f"{fields.path}: Depth (bits) is {depth:g}", "a detector has 8 to 16 bits: correct the log")
     notes.append(f"the log has no Reference Intensity: the largest {depth:g}-bit value is taken for the open beam")
     return 2.0**depth - 1
-
-
-def _projections(path: Path, fields: Statement) -> list[Path]:
-    prefix = fields.text("Filename Prefix", path.stem)
-    paths = numbered(path.parent, f"{glob.escape(prefix)}*", without=_OTHERS) or numbered(path.parent, without=_OTHERS)
-    count = fields.whole("Number of Files")
-    # Some scanners also count a last file that repeats the first angle, which may be missing.
-    if len(paths) not in (count, count - 1) or len(paths) == 0:
-        raise UserError(
-            f"{path.parent} holds {len(paths)} projections; {path.name} states {count}",
-            f"expected TIFF or PNG files named {prefix}0000.tif and so on beside the log, all of them",
-        )
-    return paths

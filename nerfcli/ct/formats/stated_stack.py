@@ -68,7 +68,7 @@ def read_stated_stack(path: Path) -> ReaderOutput:
         beam=_open_beam(file, fields, values.shape) if kind == "counts" else None,
         photons=fields.positive("photons") if "photons" in fields else None,
         held_out=_held_out(fields, views),
-        history=_truth(fields, factor),
+        truth=_truth(fields, factor),
         mm=factor,
     )
 
@@ -156,10 +156,10 @@ def _held_out(fields: Statement, views: int) -> list[int] | None:
     return stated
 
 
-def _truth(fields: Statement, factor: float) -> dict[str, Any]:
+def _truth(fields: Statement, factor: float) -> dict[str, Any] | None:
     """Describe the true volume, centred on the origin; its stated attenuation is in the inverse of the stated unit."""
     if fields.value("truth") is None:
-        return {}
+        return None
     stated = fields.nested("truth", hint="truth has volume, voxel_size and attenuation_per_value")
     path = fields.path.parent / stated.text("volume")
     try:

@@ -62,8 +62,7 @@ def read_transmission_transforms(path: Path) -> ReaderOutput:
         unit="voxel" if stated.number("voxel_size", 0.0) == 1 else UNKNOWN_UNIT,
         photons=photons,
         held_out=[view for view, frame in enumerate(frames) if frame["part"] == TRANSFORMS[1]],
-        names=[str(frame["file_path"]) for frame in frames],
-        history=_truth(folder, stated),
+        truth=_truth(folder, stated),
     )
 
 
@@ -108,12 +107,12 @@ def _values(path: Path, folder: Path, frames: list[dict[str, Any]]) -> tuple[np.
     return read_stack([folder / str(frame["file_path"]) for frame in frames]) / WHITE, "transmission", None
 
 
-def _truth(folder: Path, stated: Statement) -> dict[str, Any]:
-    """Describe the measured volume, 8-bit values with x fastest, if its file exists; else return nothing."""
+def _truth(folder: Path, stated: Statement) -> dict[str, Any] | None:
+    """Describe the measured volume, 8-bit values with x fastest, if its file exists."""
     name = stated.value("volume")
     found = re.search(r"(\d+)x(\d+)x(\d+)_uint8", str(name))
     if not isinstance(name, str) or not found or not (folder / name).is_file() or "mu_per_unit_value" not in stated:
-        return {}
+        return None
     counts = [int(number) for number in found.groups()]
     size, value = stated.number("voxel_size", 1.0), stated.number("mu_per_unit_value") / 255
     return described_truth(folder / name, "zyx", counts[::-1], size=size, attenuation_per_value=value, dtype="uint8")
