@@ -160,9 +160,7 @@ REFUSED: dict[str, tuple[Make, str, *tuple[str, ...]]] = {
     # Scanners.
     "projection missing": (lambda f: without(nikon(f).path.parent, "bone_0004.tif"), "after number 3 the numbering"),
     "last projection missing": (lambda f: without(nikon(f).path.parent, "bone_0009.tif"), "holds 8 projections"),
-    "no distance": (log(nikon, "SrcToObject=100", ""), "has no SrcToObject"),
     "negative distance": (log(nikon, "SrcToDetector=400", "SrcToDetector=-400"), "SrcToDetector is -400"),
-    "words for a number": (log(nikon, "WhiteLevel=60000", "WhiteLevel=high"), "is 'high'"),
     "no step of angles": (log(nikon, "AngularStep=30", ""), "has no AngularStep"),
     "angles for some views": (ang_file, "lists 3 angles for 9 projections"),
     "several scans in a folder": (several_scans, "holds several scans"),
@@ -181,10 +179,6 @@ REFUSED: dict[str, tuple[Make, str, *tuple[str, ...]]] = {
     "stack of another size": (frame_of_another_size, "has 5 x 3 pixels, the first projection 10 x 6"),
     "coloured picture": (coloured, "projections are grey|has the shape"),
     "unknown key": (stack_with(anlges=[1]), "'anlges' is not a key"),
-    "no JSON": (
-        lambda f: edited(stack(f).path / "scan.json", '"kind"', '"kind').parent,
-        r"scan\.json: it is not JSON: ",
-    ),
     "no projections there": (stack_with(projections="p/*.tif"), "no projections match"),
     "counts called transmissions": (stack_with(kind="transmission"), "transmissions up to"),
     "counts called line integrals": (stack_with(kind="line_integral"), "line integrals up to"),
@@ -194,10 +188,6 @@ REFUSED: dict[str, tuple[Make, str, *tuple[str, ...]]] = {
     "unit of no length": (stack_with(unit="kg"), "'kg' is not a unit of length"),
     "vectors of another shape": (stack_with(vectors=[[1, 2]] * VIEWS), "vectors"),
     "npy missing": (lambda f: without(r2_gaussian(f).path, "proj_train/0002.npy"), "0002.npy does not exist"),
-    "npy cut off": (
-        lambda f: cut(r2_gaussian(f).path / "proj_train/0002.npy", 0.3).parents[1],
-        "0002.npy cannot be read",
-    ),
     "view in both parts": (repeated_view, "is listed twice"),
     "lens and detector disagree": (
         lambda f: edited(transforms(f).path / "geometry.json", "60.0", "90.0").parent,
