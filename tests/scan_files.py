@@ -228,7 +228,7 @@ def stack(folder: Path, *, changed: dict[str, object] | None = None) -> Written:
 def transforms(folder: Path) -> Written:
     values = numbers()
     (folder / "p").mkdir()
-    lens = {"fl_x": 30.0, "fl_y": 30.0, "cx": 5.5, "cy": 2.0, "w": COLUMNS, "h": ROWS}
+    lens = {"cx": 5.5, "cy": 2.0, "w": COLUMNS, "h": ROWS}
     frames: dict[str, list[dict[str, object]]] = {"train": [], "test": []}
     for view, value in enumerate(values):
         tifffile.imwrite(folder / f"p/p_{view:03d}.tif", np.round(value * 65535).astype(np.uint16))
@@ -247,7 +247,6 @@ def transforms(folder: Path) -> Written:
         "voxel_size": 1.0,
         "volume": "v_4x3x2_uint8.raw",
         "mu_per_unit_value": 0.5,
-        "n_projections": VIEWS,
     }
     (folder / "geometry.json").write_text(json.dumps(geometry))
 

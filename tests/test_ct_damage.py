@@ -1,6 +1,5 @@
 """Damaged and mistaken scans: two lines that say what is wrong, or the right answer; never a traceback."""
 
-import json
 import re
 import shutil
 from collections.abc import Callable
@@ -25,7 +24,6 @@ from scan_files import (
     r2_gaussian,
     skyscan,
     stack,
-    transforms,
 )
 
 from nerfcli.ct.formats.read import read_scan
@@ -84,15 +82,6 @@ def coloured(folder: Path) -> Path:
     stack(folder)
     picture = np.zeros((ROWS, COLUMNS, 3), np.uint8)
     tifffile.imwrite(folder / "proj/p_000.tif", picture, photometric="rgb")
-    return folder
-
-
-def repeated_view(folder: Path) -> Path:
-    transforms(folder)
-    train = json.loads((folder / "transforms_train.json").read_text())
-    test = json.loads((folder / "transforms_test.json").read_text())
-    test["frames"].append(train["frames"][0])
-    (folder / "transforms_test.json").write_text(json.dumps(test))
     return folder
 
 
@@ -188,11 +177,6 @@ REFUSED: dict[str, tuple[Make, str, *tuple[str, ...]]] = {
     "unit of no length": (stack_with(unit="kg"), "'kg' is not a unit of length"),
     "vectors of another shape": (stack_with(vectors=[[1, 2]] * VIEWS), "vectors"),
     "npy missing": (lambda f: without(r2_gaussian(f).path, "proj_train/0002.npy"), "0002.npy does not exist"),
-    "view in both parts": (repeated_view, "is listed twice"),
-    "lens and detector disagree": (
-        lambda f: edited(transforms(f).path / "geometry.json", "60.0", "90.0").parent,
-        "fl_x is 30",
-    ),
     # Options.
     "photons of line integrals": (lambda f: heltomo(f).path, "does not apply to line integrals", "--photons", "1e4"),
     "no photons": (stack_with(), "--photons -5", "--photons", "-5"),

@@ -31,12 +31,6 @@ def read_transmission_transforms(path: Path) -> ReaderOutput:
     frames, lens = _frames(folder)
     pitch = stated.positive("detector_pitch")
     distance = stated.positive("source_detector_distance")
-    expected = stated.value("n_projections")
-    if isinstance(expected, int) and expected != len(frames):
-        raise UserError(
-            f"{folder}: {len(frames)} frames in the transforms, but {TRANSFORMS_GEOMETRY} states {expected}",
-            "check that no transform is missing",
-        )
     try:
         poses = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -45,12 +39,6 @@ def read_transmission_transforms(path: Path) -> ReaderOutput:
         raise UserError(f"{folder}: transforms of shape {poses.shape[1:]}", "each frame has a 4 x 4 matrix of numbers")
     right, up, back, source = (poses[:, :3, k] for k in range(4))
     columns, rows = lens.whole("w"), lens.whole("h")
-    for name in ("fl_x", "fl_y"):
-        if abs(lens.positive(name) * pitch - distance) > 1e-6 * distance:
-            raise UserError(
-                f"{folder}: {name} is {lens.positive(name):g} px of {pitch:g}, the detector {distance:g} away",
-                "both give the distance of the detector: correct one of them",
-            )
     geometry = ScanGeometry("cone", source, source - distance * back, pitch * right, -pitch * up, rows, columns)
     geometry = geometry.shifted(columns / 2 - lens.number("cx"), rows / 2 - lens.number("cy"))
     values, kind, photons = _values(path, folder, frames)
@@ -87,13 +75,6 @@ def _frames(folder: Path) -> tuple[list[dict[str, Any]], Statement]:
                 raise UserError(f"{folder / name}: a frame lacks file_path or transform_matrix", _HINT)
             frames.append({**frame, "part": name})
     assert lens is not None
-    names = [frame["file_path"] for frame in frames]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise UserError(
-            f"{folder}: {twice} is listed twice",
-            "remove it from one of the two files: a view is either trained on or held out",
-        )
     return sorted(frames, key=lambda frame: str(frame["file_path"])), lens
 
 
