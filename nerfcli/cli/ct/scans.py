@@ -76,7 +76,7 @@ def convert(
     Formats read: DataExchange and NXtomo (.h5, .nxs), Nikon (.xtekct), SkyScan (.log), HelTomo (.mat), R2-Gaussian
     (meta_data.json), pictures with a scan.json that states what they are; see docs/tomography.md.
 
-    SCAN/scene.json has ASTRA's vectors. What was written is read back and compared.
+    SCAN/scene.json has ASTRA's vectors.
 
     \b
     Examples:
