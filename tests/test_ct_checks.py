@@ -203,6 +203,6 @@ def test_flats_determine_the_number_of_photons() -> None:
     lamp = 1 + 0.02 * rng.normal(size=(12, 1, 1))
     flats = 50 + 0.25 * rng.poisson(8000 * lamp * np.ones((12, 40, 40))) + rng.normal(0, 12, (12, 40, 40))
     darks = 50 + rng.normal(0, 12, (12, 40, 40))
-    found = open_beam_of(flats, darks)
+    found = open_beam_of(flats, darks, projections=(1, 40, 40), path=Path())
     assert found.photons_per_value == pytest.approx(4.0, rel=0.05)
     assert float(found.values.mean()) == pytest.approx(2000, rel=0.01)

@@ -180,7 +180,7 @@ REFUSED: dict[str, tuple[Make, str, *tuple[str, ...]]] = {
     # Options.
     "photons of line integrals": (lambda f: heltomo(f).path, "does not apply to line integrals", "--photons", "1e4"),
     "no photons": (stack_with(), "--photons -5", "--photons", "-5"),
-    "unit that is none": (stack_with(), "--unit parsec is not a unit", "--unit", "parsec"),
+    "unit that is none": (stack_with(), "--unit: 'parsec' is not a unit", "--unit", "parsec"),
     "a unit and no size": (
         detector("x_pixel_size", None),
         "states no pixel size, to which --unit um would apply",

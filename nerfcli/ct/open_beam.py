@@ -34,24 +34,7 @@ class OpenBeam:
     photons_per_value: float | None
 
 
-def check_sizes(
-    projections: tuple[int, ...], *, flats: np.ndarray | None, darks: np.ndarray | None, path: Path
-) -> None:
-    """Raise unless flats and darks of a scan at a path have the size of its projections, given by their shape.
-
-    Raises:
-        UserError: another size.
-    """
-    for name, frames in (("flats", flats), ("darks", darks)):
-        if frames is not None and frames.shape[1:] != projections[1:]:
-            raise UserError(
-                f"{path}: {name} of {frames.shape[2]} x {frames.shape[1]} pixels, projections of "
-                f"{projections[2]} x {projections[1]}",
-                "flats and darks come from the detector of the projections: crop them the same way",
-            )
-
-
-def open_beam_of(flats: np.ndarray, darks: np.ndarray | None) -> OpenBeam:
+def open_beam_of(flats: np.ndarray, darks: np.ndarray | None, *, projections: tuple[int, ...], path: Path) -> OpenBeam:
     """Average flats and darks.
 
     Each pixel is the mean over frames without outliers (gamma quanta that hit the camera, a frame taken with the
@@ -61,10 +44,18 @@ def open_beam_of(flats: np.ndarray, darks: np.ndarray | None) -> OpenBeam:
     Args:
         flats: (frames, rows, columns) detector values.
         darks: likewise, or None.
+        projections: shape of the projections of the scan at `path`.
 
     Raises:
-        UserError: the flats are all 0, or darker than the darks.
+        UserError: they have not the size of the projections, or the flats are all 0, or darker than the darks.
     """
+    for name, frames in (("flats", flats), ("darks", darks)):
+        if frames is not None and frames.shape[1:] != projections[1:]:
+            raise UserError(
+                f"{path}: {name} of {frames.shape[2]} x {frames.shape[1]} pixels, projections of "
+                f"{projections[2]} x {projections[1]}",
+                "flats and darks come from the detector of the projections: crop them the same way",
+            )
     flat = robust_mean(flats)
     dark = None if darks is None or len(darks) == 0 else robust_mean(darks)
     beam = flat if dark is None else flat - dark

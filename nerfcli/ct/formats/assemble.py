@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from nerfcli.captures.holdout import names_held_out
-from nerfcli.ct.formats.statement import MILLIMETRES, ScanOptions
+from nerfcli.ct.formats.statement import ScanOptions, millimetres
 from nerfcli.ct.geometry import Circle, ScanGeometry
 from nerfcli.ct.open_beam import OpenBeam
 from nerfcli.ct.scan import Kind, Scan, held_out_views
@@ -150,17 +150,12 @@ def _unit(found: ReaderOutput, given: ScanOptions) -> tuple[str, float]:
     """Return the scan's unit of lengths, mm if the user gave one, and the factor on those of the reader's geometry."""
     if given.unit is None:
         return found.unit, found.mm or 1.0
-    factor = MILLIMETRES.get(given.unit)
-    if factor is None:
-        raise UserError(
-            f"--unit {given.unit} is not a unit of length", f"choose one of {', '.join(sorted(MILLIMETRES))}"
-        )
     if found.mm is None:
         raise UserError(
             f"{found.path} states no pixel size, to which --unit {given.unit} would apply",
             "store the size in the file as x_pixel_size, or leave out --unit: lengths are then in pixels",
         )
-    return "mm", factor
+    return "mm", millimetres(given.unit, where="--unit")
 
 
 def _with_centre(geometry: ScanGeometry, column: float) -> ScanGeometry:

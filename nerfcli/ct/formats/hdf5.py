@@ -12,7 +12,7 @@ import numpy as np
 from nerfcli.ct.formats.assemble import ReaderOutput
 from nerfcli.ct.formats.statement import angles_in_radians, millimetres
 from nerfcli.ct.geometry import Circle
-from nerfcli.ct.open_beam import check_sizes, open_beam_of
+from nerfcli.ct.open_beam import open_beam_of
 from nerfcli.ct.recognise import datasets_in, open_hdf5
 from nerfcli.errors import UserError
 
@@ -82,7 +82,6 @@ def _parallel(
     darks: np.ndarray | None,
     sides: tuple[float, float, float] | None,
 ) -> ReaderOutput:
-    check_sizes(data.shape, flats=flats, darks=darks, path=path)
     notes = ["the file does not say which way the source moved: counter-clockwise around the object is assumed"]
     width, height, mm = (1.0, 1.0, None) if sides is None else sides
     circle = Circle("parallel", tuple(angles.tolist()), width, height, data.shape[1], data.shape[2])
@@ -97,7 +96,7 @@ def _parallel(
             )
         notes.append("there are no flats: values are taken as transmissions")
     else:
-        beam = open_beam_of(flats, darks)
+        beam = open_beam_of(flats, darks, projections=data.shape, path=path)
     kind = "transmission" if beam is None else "counts"
     unit = "voxel" if sides is None else "mm"
     return ReaderOutput(path, form, data, kind, circle, unit, beam=beam, notes=notes, mm=mm)

@@ -34,7 +34,7 @@ from nerfcli.ct.formats.assemble import ReaderOutput
 from nerfcli.ct.formats.pictures import SUFFIXES, numbered, read_npy, read_stack
 from nerfcli.ct.formats.statement import Statement, angles_in_radians, millimetres, read_object
 from nerfcli.ct.geometry import BEAMS, Beam, Circle, ScanGeometry, from_vectors
-from nerfcli.ct.open_beam import OpenBeam, check_sizes, open_beam_of
+from nerfcli.ct.open_beam import OpenBeam, open_beam_of
 from nerfcli.ct.recognise import STACK
 from nerfcli.ct.scan import KINDS
 from nerfcli.ct.truth import described_truth
@@ -124,8 +124,7 @@ def _open_beam(file: Path, fields: Statement, shape: tuple[int, ...]) -> OpenBea
         flats = np.full((1, *shape[1:]), fields.positive("white_level"), dtype=np.float32)
     else:
         raise UserError(f"{file}: counts without flats", "name the flats, or a white_level, or say kind transmission")
-    check_sizes(shape, flats=flats, darks=darks, path=file)
-    return open_beam_of(flats, darks)
+    return open_beam_of(flats, darks, projections=shape, path=file)
 
 
 def _pictures(file: Path, pattern: str, what: str) -> np.ndarray:

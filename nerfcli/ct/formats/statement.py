@@ -54,7 +54,7 @@ def millimetres(unit: str, *, where: str) -> float:
     """
     found = MILLIMETRES.get(unit.strip().lower())
     if found is None:
-        raise UserError(f"{where}: {unit!r} is not a unit of length", "set it with --unit: m, mm, um or nm")
+        raise UserError(f"{where}: {unit!r} is not a unit of length", "set it with --unit: m, cm, mm, um or nm")
     return found
 
 
@@ -184,9 +184,5 @@ def read_lines(path: Path, *, hint: str) -> Statement:
 
 
 def read_object(path: Path, *, hint: str) -> Statement:
-    """Read a JSON object.
-
-    Raises:
-        UserError: it cannot be read, or is not a JSON object.
-    """
+    """Read a JSON object; raise a UserError if the file has none."""
     return Statement(path, read_json(path, needed=(), hint=hint), hint=hint)
