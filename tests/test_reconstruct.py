@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 from ellipsoids import attenuation_of_voxels, bean, line_integrals
-from scipy.ndimage import binary_erosion, gaussian_filter
+from scipy.ndimage import binary_erosion
 from tomography import sart_total_variation
 
 from nerfcli.ct import reconstruct as reconstruction
-from nerfcli.ct.baselines import filtered_back_projection, filtered_misfit, logarithms
+from nerfcli.ct.baselines import filtered_back_projection, logarithms
 from nerfcli.ct.calibrate import air_factors, detector_tilt, found_noise
 from nerfcli.ct.evaluate import resampled, score_projections, score_volume
 from nerfcli.ct.geometry import Circle, ScanGeometry
@@ -265,23 +265,6 @@ def test_too_much_assumed_noise_is_corrected_by_views_that_were_left_out(kind: s
     )
     assert after > before + 3, (before, after, baseline)
     assert before + 1 < baseline + 1 < after, (before, after, baseline)
-
-
-@pytest.mark.parametrize(("views", "filtered_is_better"), [(90, True), (8, False)])
-def test_the_filtered_misfit_ranks_volumes_as_their_errors_do(
-    views: int, filtered_is_better: bool, grid: VoxelGrid
-) -> None:
-    """Back-projection of many views is sharper than a smooth volume, of few views it is worse."""
-    geometry, true = cone(views), truth(grid)
-    integrals = scan_of(geometry, photons=1e9).line_integrals(np.arange(views))
-    found = {
-        "filtered": filtered_back_projection(geometry, integrals, grid).clamp_min(0),
-        "smooth": torch.from_numpy(gaussian_filter(true, 1.0)),
-    }
-    errors = {name: float(((volume.numpy() - true) ** 2).sum()) for name, volume in found.items()}
-    misfits = {name: filtered_misfit(geometry, integrals, grid, volume) for name, volume in found.items()}
-    assert (errors["filtered"] < errors["smooth"]) == filtered_is_better, errors
-    assert (misfits["filtered"] < misfits["smooth"]) == filtered_is_better, misfits
 
 
 def test_a_tilt_is_not_estimated_where_time_is_short() -> None:

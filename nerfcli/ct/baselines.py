@@ -9,7 +9,6 @@ from torch.nn.functional import grid_sample
 
 from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.grid import VoxelGrid
-from nerfcli.ct.reconstruct import Projector
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
 
@@ -89,16 +88,6 @@ def filtered_back_projection(geometry: ScanGeometry, integrals: np.ndarray, grid
         )
         volume += seen.view(grid.shape) / depth.square().float()
     return volume * (np.pi / geometry.views)  # over a full turn, each line is measured from both of its ends
-
-
-def filtered_misfit(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGrid, volume: Tensor) -> float:
-    """Return the sum of squared misfits of a volume, weighted by frequency along the rows (the ramp).
-
-    As the projections of an error have its spectrum on lines through the origin, this is proportional to the squared
-    error of the volume, if the data have no noise and views are dense.
-    """
-    left = integrals - Projector(geometry, grid).forward(volume).view(integrals.shape).numpy()
-    return float((left * _ramp(left.astype(np.float64), 1.0)).sum())
 
 
 def _ramp(projections: np.ndarray, width: float) -> np.ndarray:

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from nerfcli.atomic import clear_leftovers, exclusive
-from nerfcli.ct.baselines import filtered_back_projection, filtered_misfit, logarithms
 from nerfcli.ct.calibrate import air_factors, beside_object, detector_tilt, found_noise
 from nerfcli.ct.centre import FEWEST_VIEWS, centre_of
 from nerfcli.ct.formats.assemble import axis_column
@@ -168,8 +167,7 @@ def _fit(
     used = earlier.used if earlier is not None else _estimates(scan, settings, decisions, reporter.progress)
     geometry = scan.geometry.corrected(float(used["centre"]), float(used["tilt"]))
     grid = earlier.grid if earlier is not None else grid_of_scan(geometry, settings.voxel_size)
-    lower = float(used.get("noise_lower", 1.0))
-    if lower > 1:
+    if (lower := float(used.get("noise_lower", 1.0))) > 1:
         scan = with_noise(scan, lower=lower)
     problem = _problem(scan, geometry, grid, used)
     if earlier is not None:
@@ -180,10 +178,7 @@ def _fit(
         limit = seconds_left(settings.budget_seconds, begun)
         limit = None if limit is None else COARSE_FRACTION * limit
         strength = used["strength"]
-        fit = reconstruct(coarse, start(coarse), strength=strength, passes=COARSE_PASSES, seconds=limit)
-        fit = finer(fit, grid)
-        if lower > 1:
-            fit = _better_start(fit, problem, logarithms(scan, used["air"]))
+        fit = finer(reconstruct(coarse, start(coarse), strength=strength, passes=COARSE_PASSES, seconds=limit), grid)
     kept, interrupt = deque([fit], maxlen=1), None
     with deferred_interrupts() as interrupts:
 
@@ -325,20 +320,6 @@ def _air(
         f"{100 * error:.2f} %"
     )
     return [float(f) for f in factors]
-
-
-def _better_start(coarse: Fit, problem: Problem, integrals: np.ndarray) -> Fit:
-    """Return the better start where noise is negligible: a coarse fit, or filtered back-projection, which is sharper.
-
-    With few views, or over a limited angle, back-projection is worse; where the views are no circle, there is none.
-    """
-    geometry, grid = problem.geometry, problem.grid
-    try:
-        filtered = filtered_back_projection(geometry, integrals, grid).clamp_min(0)
-    except UserError:  # no circle
-        return coarse
-    sharp, smooth = (filtered_misfit(geometry, integrals, grid, each) for each in (filtered, coarse.volume))
-    return replace(coarse, volume=filtered) if sharp < smooth else coarse
 
 
 def _fits_memory(grid: VoxelGrid) -> None:
