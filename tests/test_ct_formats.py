@@ -11,7 +11,7 @@ from scan_files import WRITERS, Written, nikon, stack
 from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.formats.read import read_scan
 from nerfcli.ct.formats.statement import ScanOptions
-from nerfcli.ct.geometry import Beam, Circle, ScanGeometry, circle_of
+from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.recognise import recognise
 from nerfcli.ct.scan import load_scan
 from nerfcli.ct.truth import load_truth
@@ -33,7 +33,7 @@ def pixels_by_formula(written: Written, geometry: ScanGeometry) -> tuple[np.ndar
 def test_points_are_seen_where_the_formula_of_the_format_says(form: str, tmp_path: Path) -> None:
     """Independent: every format's formula turns the object, or is a pinhole camera; 1e-9 px in all views.
 
-    What convert stores is the same, and a circle is recovered from its vectors by other formulas.
+    What convert stores is the same.
     """
     written = WRITERS[form](tmp_path)
     assert recognise(written.path) == form
@@ -46,7 +46,6 @@ def test_points_are_seen_where_the_formula_of_the_format_says(form: str, tmp_pat
     stored = load_scan(tmp_path / "out")
     np.testing.assert_allclose(stored.geometry.vectors(), scan.geometry.vectors(), rtol=0, atol=1e-12)
     np.testing.assert_array_equal(stored.values, scan.values)
-    assert circle_of(scan.geometry)[1] < 1e-9
 
 
 @pytest.mark.parametrize(("top", "bottom"), [(0.0, 0.0), (5.0, 5.0), (0.4, -0.4)])
@@ -85,8 +84,7 @@ def test_options_say_more_than_the_file(tmp_path: Path) -> None:
     assert scan.held_out == (0, 4, 8)
     assert plain.held_out == (1, 4)
     assert scan.geometry.pixel_at_origin[1] == pytest.approx(plain.geometry.pixel_at_origin[1] / 10)
-    assert not circle_of(scan.geometry)[0].mirrored
-    assert circle_of(plain.geometry)[0].mirrored
+    np.testing.assert_allclose(scan.geometry.column_step, -plain.geometry.column_step / 10, rtol=1e-12)
 
 
 def test_a_view_that_is_stated_twice_is_held_out_once(tmp_path: Path) -> None:
@@ -130,17 +128,3 @@ def test_info_says_what_a_scan_is(tmp_path: Path) -> None:
     assert facts["source_origin"] == pytest.approx(410)
     text = nerfcli("ct", "info", tmp_path / "o").stdout
     assert "detector: 10 x 6 pixels" in text
-
-
-@pytest.mark.parametrize("beam", ["cone", "parallel"])
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_a_circle_is_recovered_from_its_vectors(beam: Beam, mirrored: bool) -> None:
-    """Round trip with every number in use."""
-    distances = (100.0, 300.0, 1.5) if beam == "cone" else (0.0, 0.0, 0.0)
-    angles = tuple(np.radians([5.0, 95.0, 185.0, 310.0]).tolist())
-    circle = Circle(beam, angles, *(0.2, 0.3, 7, 11), *distances, 1.25, -0.75, 0.02, mirrored)
-    found, apart = circle_of(circle.geometry())
-    assert apart < 1e-9
-    turns = np.exp(1j * np.array([circle.angles, found.angles]))
-    np.testing.assert_allclose(turns[0], turns[1], atol=1e-12)
-    assert vars(found) | {"angles": None} == pytest.approx(vars(circle) | {"angles": None}, abs=1e-9)

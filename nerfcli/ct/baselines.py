@@ -7,13 +7,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from nerfcli.ct.geometry import ScanGeometry
+from nerfcli.ct.geometry import CIRCULAR, ScanGeometry
 from nerfcli.ct.grid import VoxelGrid
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
-
-# Largest deviation of a geometry from a circle around z, as a fraction of its radius and in cosines.
-_CIRCULAR = 1e-3
 
 
 def logarithms(scan: Scan, air: Sequence[float] | None) -> np.ndarray:
@@ -50,7 +47,12 @@ def filtered_back_projection(geometry: ScanGeometry, integrals: np.ndarray, grid
     height, width = geometry.pixel_at_origin
     outward = -geometry.emitter if geometry.beam == "parallel" else geometry.emitter
     radius = float(np.median(np.linalg.norm(outward, axis=1)))
-    _check_circle(geometry, outward / radius)
+    down = geometry.row_step / np.linalg.norm(geometry.row_step, axis=1, keepdims=True)
+    if not geometry.is_circular or np.abs(down[:, :2]).max() >= CIRCULAR:
+        raise UserError(
+            "filtered back-projection needs a source on a circle around z and an upright detector",
+            "use it for scans on a circle",
+        )
     columns = np.arange(geometry.columns) - (geometry.columns - 1) / 2
     rows = np.arange(geometry.rows) - (geometry.rows - 1) / 2
     # Coordinates on a detector through the axis.
@@ -101,14 +103,3 @@ def _ramp(projections: np.ndarray, width: float) -> np.ndarray:
     kernel[odd] = -1 / (np.pi * place[odd] * width) ** 2
     response = np.fft.rfft(np.fft.ifftshift(kernel))
     return np.fft.irfft(np.fft.rfft(projections, length) * response, length)[..., :count] * width
-
-
-def _check_circle(geometry: ScanGeometry, outward: np.ndarray) -> None:
-    circular = np.abs(outward[:, 2]).max() < _CIRCULAR and np.abs(np.linalg.norm(outward, axis=1) - 1).max() < _CIRCULAR
-    down = geometry.row_step / np.linalg.norm(geometry.row_step, axis=1, keepdims=True)
-    upright = np.abs(down[:, :2]).max() < _CIRCULAR
-    if not (circular and upright):
-        raise UserError(
-            "filtered back-projection needs a source on a circle around z and an upright detector",
-            "use it for scans on a circle",
-        )

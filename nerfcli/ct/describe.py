@@ -7,7 +7,7 @@ import numpy as np
 
 from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.formats.read import read_scan
-from nerfcli.ct.geometry import circle_of
+from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.recognise import is_reconstruction
 from nerfcli.ct.result import load_reconstruction
 from nerfcli.ct.scan import MEASUREMENT, Scan
@@ -44,9 +44,6 @@ def facts_of(scan: Scan) -> dict[str, Any]:
     """Return the facts of a scan that `nerfcli ct info` shows, as plain values."""
     geometry = scan.geometry
     height, width = geometry.pixel_at_origin
-    circle, apart = circle_of(geometry)
-    angles = np.degrees(np.array(circle.angles))
-    around = apart < 1e-3
     return {
         "measurement": MEASUREMENT,
         "format": scan.history.get("format"),
@@ -58,14 +55,28 @@ def facts_of(scan: Scan) -> dict[str, Any]:
         "unit": scan.unit,
         "pixel_at_object": {"width": _rounded(width), "height": _rounded(height)},
         "magnification": _rounded(np.median(geometry.magnification)),
-        "angles_deg": {"from": _rounded(angles.min()), "to": _rounded(angles.max())} if around else None,
-        "orbit": "a circle" if around else "views that are not on one circle",
-        "source_origin": _rounded(circle.source_origin) if around and geometry.beam == "cone" else None,
-        "source_detector": _rounded(circle.source_detector) if around and geometry.beam == "cone" else None,
+        **_orbit(geometry),
         "axis_column": float(f"{axis_column(geometry):.6g}"),
         "photons_per_value": scan.photons_per_value,
         "unusable": None if scan.usable is None else float(f"{1 - float(scan.usable.mean()):.4g}"),
         "truth": (scan.history.get("truth") or {}).get("path"),
+    }
+
+
+def _orbit(geometry: ScanGeometry) -> dict[str, Any]:
+    """Return the angles, and the distances of a cone beam, along the normals of the detector."""
+    if not geometry.is_circular:
+        return {"orbit": "views that are not on one circle"}
+    parallel = geometry.beam == "parallel"
+    to_source = -geometry.emitter if parallel else geometry.emitter - geometry.centre
+    outward = np.cross(geometry.column_step, geometry.row_step)
+    outward *= np.sign((outward * to_source).sum(1, keepdims=True)) / np.linalg.norm(outward, axis=1, keepdims=True)
+    angles = np.degrees(np.unwrap(np.arctan2(outward[:, 1], outward[:, 0])))
+    distances = {"source_origin": geometry.emitter, "source_detector": to_source}
+    return {
+        "angles_deg": {"from": _rounded(angles.min()), "to": _rounded(angles.max())},
+        "orbit": "a circle",
+        **{name: None if parallel else _rounded(np.median((v * outward).sum(1))) for name, v in distances.items()},
     }
 
 

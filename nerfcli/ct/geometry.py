@@ -5,7 +5,7 @@ These are ASTRA's vectors (`parallel3d_vec`, `cone_vec`); every other descriptio
 object is fixed, and its frame is that of the volume: lengths in the scan's unit, z along the usual rotation axis.
 
 Most scanners describe a circular scan: a source and a flat detector around an axis. `Circle.geometry` turns such a
-description into vectors, and `circle_of` turns vectors into a description by independent formulas.
+description into vectors.
 """
 
 from dataclasses import dataclass, replace
@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike
 
 Beam = Literal["cone", "parallel"]
 BEAMS: tuple[Beam, ...] = ("cone", "parallel")
+# Largest deviation of a source from a circle around z, as a fraction of its radius.
+CIRCULAR = 1e-3
 
 
 @dataclass(frozen=True)
@@ -173,6 +175,14 @@ class ScanGeometry:
         width = np.linalg.norm(self.column_step, axis=1) / self.magnification
         return float(np.median(height)), float(np.median(width))
 
+    @property
+    def is_circular(self) -> bool:
+        """Whether the source is on a circle around z, which is infinitely large for parallel beams."""
+        distances = np.linalg.norm(self.emitter, axis=1)
+        radius = float(np.median(distances))
+        off = max(np.abs(self.emitter[:, 2]).max(), np.abs(distances - radius).max())
+        return bool(off < CIRCULAR * radius)
+
     def vectors(self) -> np.ndarray:
         """Return ASTRA's vectors (V, 12): source or direction, detector's centre, column step, row step."""
         return np.concatenate([self.emitter, self.centre, self.column_step, self.row_step], axis=1)
@@ -254,67 +264,3 @@ class Circle:
         geometry = ScanGeometry(self.beam, emitter, centre + self.lateral * right, *steps, self.rows, self.columns)
         geometry = geometry.shifted(self.column_shift, self.row_shift).tilted(self.tilt)
         return geometry.mirrored() if self.mirrored else geometry
-
-
-def circle_of(geometry: ScanGeometry) -> tuple[Circle, float]:
-    """Fit a circle to a geometry; also return its distance from the geometry.
-
-    Returns:
-        The circle, with medians over views for all but the angles; and the largest distance between its detector
-        corners or source and those of the geometry, in widths of a detector pixel.
-    """
-    normal = np.cross(geometry.column_step, geometry.row_step)
-    to_source = -geometry.emitter if geometry.beam == "parallel" else geometry.emitter - geometry.centre
-    mirrored = bool(np.median((normal * to_source).sum(1)) > 0)
-    turned = geometry
-    if mirrored:
-        geometry, normal = geometry.mirrored(), -normal
-    outward = -normal / np.linalg.norm(normal, axis=1, keepdims=True)
-    angles = np.unwrap(np.arctan2(outward[:, 1], outward[:, 0]))
-    outward = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
-    right = np.stack([-np.sin(angles), np.cos(angles), np.zeros_like(angles)], axis=1)
-    width = np.linalg.norm(geometry.column_step, axis=1)
-    height = np.linalg.norm(geometry.row_step, axis=1)
-    tilt = np.arctan2(-geometry.column_step[:, 2], (geometry.column_step * right).sum(1))
-    if geometry.beam == "parallel":
-        source_origin = source_detector = lateral = np.zeros(1)
-        across = (geometry.centre * right).sum(1)
-    else:
-        source_origin = (geometry.emitter * outward).sum(1)
-        source_detector = ((geometry.emitter - geometry.centre) * outward).sum(1)
-        lateral = (geometry.emitter * right).sum(1)
-        across = (geometry.centre * right).sum(1) - lateral
-    found = Circle(
-        geometry.beam,
-        tuple(angles.tolist()),
-        float(np.median(width)),
-        float(np.median(height)),
-        geometry.rows,
-        geometry.columns,
-        float(np.median(source_origin)),
-        float(np.median(source_detector)),
-        float(np.median(lateral)),
-        float(np.median(across / width)),
-        float(np.median(-geometry.centre[:, 2] / height)),
-        float(np.median(tilt)),
-        mirrored,
-    )
-    try:
-        return found, _distance(found.geometry(), turned) / found.pixel_width
-    except ValueError:  # the source is not on the outer side of the axis
-        return found, float("inf")
-
-
-def _distance(one: ScanGeometry, other: ScanGeometry) -> float:
-    """Return the largest distance between detector corners, or sources; for parallel beams only across the rays."""
-    worst = 0.0
-    for along in (-0.5, 0.5):
-        for down in (-0.5, 0.5):
-            corners = [g.centre + along * g.columns * g.column_step + down * g.rows * g.row_step for g in (one, other)]
-            apart = corners[0] - corners[1]
-            if one.beam == "parallel":
-                apart = apart - (apart * other.emitter).sum(1, keepdims=True) * other.emitter
-            worst = max(worst, float(np.linalg.norm(apart, axis=1).max()))
-    if one.beam == "cone":
-        worst = max(worst, float(np.linalg.norm(one.emitter - other.emitter, axis=1).max()))
-    return worst

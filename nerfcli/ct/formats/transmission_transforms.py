@@ -14,7 +14,7 @@ import numpy as np
 from nerfcli.ct.formats.assemble import UNKNOWN_UNIT, ReaderOutput
 from nerfcli.ct.formats.pictures import read_npy, read_stack
 from nerfcli.ct.formats.statement import Statement, read_object
-from nerfcli.ct.geometry import ScanGeometry, circle_of
+from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.recognise import TRANSFORMS, TRANSFORMS_GEOMETRY
 from nerfcli.ct.scan import Kind
 from nerfcli.ct.truth import described_truth
@@ -42,11 +42,10 @@ def read_transmission_transforms(path: Path) -> ReaderOutput:
     geometry = ScanGeometry("cone", source, source - distance * back, pitch * right, -pitch * up, rows, columns)
     geometry = geometry.shifted(columns / 2 - lens.number("cx"), rows / 2 - lens.number("cy"))
     values, kind, photons = _values(path, folder, frames)
-    circle, apart = circle_of(geometry)
     return ReaderOutput(
         *(path, "transmission-transforms", values),
         kind=kind,
-        geometry=circle if apart < 1e-6 else geometry,
+        geometry=geometry,
         unit="voxel" if stated.number("voxel_size", 0.0) == 1 else UNKNOWN_UNIT,
         photons=photons,
         held_out=[view for view, frame in enumerate(frames) if frame["part"] == TRANSFORMS[1]],
