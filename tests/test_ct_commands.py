@@ -30,6 +30,7 @@ from nerfcli.ct.result import ReconstructionSettings, load_reconstruction, save_
 from nerfcli.ct.result import scan_of as scan_behind
 from nerfcli.ct.scan import save_scan
 from nerfcli.ct.train import train_scan
+from nerfcli.ct.truth import described_truth
 from nerfcli.errors import BAD_INPUT, OUT_OF_MEMORY, UserError
 from nerfcli.interrupts import Terminated
 from nerfcli.notices import Reporter
@@ -45,14 +46,7 @@ def bean_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     true = attenuation_of_voxels(bean(), x=grid.axis("x"), y=grid.axis("y"), z=grid.axis("z")).astype(np.float32)
     np.save(folder / "truth.npy", true)
     scan = scan_of(cone(rows=18, columns=30, pixel=1.2), held_out=(0, 6, 12, 18, 24))
-    described = {
-        "path": str(folder / "truth.npy"),
-        "shape": list(true.shape),
-        "layout": "zyx",
-        "attenuation_per_value": 1.0,
-        "first": list(grid.first),
-        "size": grid.size,
-    }
+    described = described_truth(folder / "truth.npy", "zyx", true.shape, size=grid.size, attenuation_per_value=1.0)
     save_scan(folder / "bean", replace(scan, history={"truth": described}))
     trained = completed("ct", "train", folder / "bean", "--passes", "8", "--centre", "0", "--tilt", "0")
     assert trained.stdout.strip() == str(folder / "bean-run")

@@ -119,12 +119,10 @@ def test_info_says_what_a_scan_is(tmp_path: Path) -> None:
     written = stack(tmp_path)
     nerfcli("ct", "convert", written.path, tmp_path / "o")
     facts = json.loads(nerfcli("ct", "info", tmp_path / "o", "--json").stdout)
-    assert facts["views"] == 9
-    assert facts["held_out"] == 2
-    assert facts["detector"] == "10 x 6 pixels"
-    assert facts["beam"] == "cone"
-    assert facts["unit"] == "mm"
-    assert facts["magnification"] == pytest.approx(55 / 41, rel=1e-5)
-    assert facts["source_origin"] == pytest.approx(410)
+    stated = {"views": 9, "held_out": 2, "detector": "10 x 6 pixels", "beam": "cone", "unit": "mm", "orbit": "a circle"}
+    assert {name: facts[name] for name in stated} == stated
+    lengths = (facts["magnification"], facts["source_origin"], facts["source_detector"])
+    assert lengths == pytest.approx((55 / 41, 410, 550), rel=1e-5)
+    assert facts["angles_deg"] == {"from": -250, "to": -10}
     text = nerfcli("ct", "info", tmp_path / "o").stdout
     assert "detector: 10 x 6 pixels" in text

@@ -146,16 +146,7 @@ def test_filtered_back_projection_has_the_right_scale(beam: str) -> None:
 
 
 def test_filtered_back_projection_refuses_what_is_no_circle() -> None:
-    geometry = cone()
-    lifted = ScanGeometry(
-        "cone",
-        geometry.emitter + np.array([0, 0, 5.0]),
-        geometry.centre,
-        geometry.column_step,
-        geometry.row_step,
-        24,
-        40,
-    )
+    lifted = replace(cone(), emitter=cone().emitter + np.array([0, 0, 5.0]))
     with pytest.raises(UserError, match="a source on a circle"):
         filtered_back_projection(lifted, np.zeros((30, 24, 40)), centred_grid((4.0, 4.0, 4.0), 1.0))
 
