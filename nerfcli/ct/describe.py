@@ -92,5 +92,5 @@ def in_words(scan: Scan) -> str:
     """Describe a scan in a few words."""
     geometry = scan.geometry
     size = f"{geometry.columns} x {geometry.rows} pixels"
-    words = f"{geometry.views} views of {size}, {_beam(scan)} beam, {scan.kind.replace('_', ' ')}s"
-    return words.replace("countss", "counts") + f", {len(scan.held_out)} held out"
+    kind = scan.kind.removesuffix("s").replace("_", " ")
+    return f"{geometry.views} views of {size}, {_beam(scan)} beam, {kind}s, {len(scan.held_out)} held out"

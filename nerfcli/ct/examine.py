@@ -48,16 +48,11 @@ class ScanDiagnosis:
     not_checked: tuple[tuple[str, str], ...]
 
     @property
-    def verdict(self) -> str:
-        """The worst of the findings' verdicts."""
-        return worst(finding.verdict for finding in self.findings)
-
-    @property
     def record(self) -> dict[str, Any]:
         """The findings as plain values."""
         return {
             "kind": "scan",
-            "verdict": self.verdict,
+            "verdict": worst(finding.verdict for finding in self.findings),
             "findings": [as_json(finding) for finding in self.findings],
             "not_checked": dict(self.not_checked),
         }

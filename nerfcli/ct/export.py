@@ -25,9 +25,11 @@ from nerfcli.output import Output
 
 _NIFTI_HEADER = 352
 _NIFTI_UNITS = {"m": 1, "mm": 2, "um": 3}
-_NIFTI_TYPES = {np.dtype(np.uint8): (2, 8), np.dtype(np.float32): (16, 32)}
-_NRRD_TYPES = {np.dtype(np.uint8): "uchar", np.dtype(np.float32): "float"}
-_WORDS = {np.dtype(np.uint8): "MET_UCHAR", np.dtype(np.float32): "MET_FLOAT"}
+# Content and types of volumes: the name of the map, the types of NRRD and MetaImage, code and bits of NIfTI.
+_TYPES = {
+    np.dtype(np.uint8): ("marks", "uchar", "MET_UCHAR", (2, 8)),
+    np.dtype(np.float32): ("attenuation", "float", "MET_FLOAT", (16, 32)),
+}
 
 
 @dataclass(frozen=True)
@@ -95,16 +97,12 @@ def write_volume(path: Path, volume: VolumeFile) -> None:
         UserError: the suffix is none of these, or the file cannot be written.
         ValueError: the values have another type.
     """
-    if volume.values.dtype not in _WORDS:
+    if volume.values.dtype not in _TYPES:
         raise ValueError(f"volumes are float32 or uint8, not {volume.values.dtype}")
     if path.suffix.lower() not in _WRITERS:
         raise UserError(f"{path.name}: unknown volume format", f"choose one of {', '.join(VOLUMES)}")
     with atomic_path(path) as partial:
         _WRITERS[path.suffix.lower()](partial, volume)
-
-
-def _name_of(volume: VolumeFile) -> str:
-    return "marks" if volume.values.dtype == np.uint8 else "attenuation"
 
 
 def _write_nrrd(path: Path, volume: VolumeFile) -> None:
@@ -113,12 +111,12 @@ def _write_nrrd(path: Path, volume: VolumeFile) -> None:
     Source: Definition of NRRD File Format, teem.sourceforge.net/nrrd/format.html.
     """
     unit = volume.unit if volume.unit in ("mm", "um") else "arbitrary"
-    size, name = f"{volume.grid.size:.17g}", _name_of(volume)
+    size, (name, kind, *_) = f"{volume.grid.size:.17g}", _TYPES[volume.values.dtype]
     stated = {"unit": volume.unit, "quantity": volume.quantity, "map": name}
     lines = [
         "NRRD0005",
         f"# {name} by nerfcli",
-        f"type: {_NRRD_TYPES[volume.values.dtype]}",
+        f"type: {kind}",
         "dimension: 3",
         "space dimension: 3",
         f"sizes: {' '.join(map(str, reversed(volume.grid.shape)))}",
@@ -150,7 +148,7 @@ def _write_mha(path: Path, volume: VolumeFile) -> None:
         f"Offset = {first[0]!r} {first[1]!r} {first[2]!r}",
         f"ElementSpacing = {size!r} {size!r} {size!r}",
         f"DimSize = {x} {y} {z}",
-        f"ElementType = {_WORDS[volume.values.dtype]}",
+        f"ElementType = {_TYPES[volume.values.dtype][2]}",
         "ElementDataFile = LOCAL",
     ]
     path.write_bytes(("\n".join(lines) + "\n").encode("ascii") + volume.values.tobytes())
@@ -159,11 +157,10 @@ def _write_mha(path: Path, volume: VolumeFile) -> None:
 def _write_nifti(path: Path, volume: VolumeFile) -> None:
     z, y, x = volume.grid.shape
     size, first = volume.grid.size, volume.grid.first
-    code, bits = _NIFTI_TYPES[volume.values.dtype]
     header = bytearray(_NIFTI_HEADER)
     struct.pack_into("<i", header, 0, 348)
     struct.pack_into("<8h", header, 40, 3, x, y, z, 1, 1, 1, 1)
-    struct.pack_into("<2h", header, 70, code, bits)
+    struct.pack_into("<2h", header, 70, *_TYPES[volume.values.dtype][3])
     struct.pack_into("<8f", header, 76, 1, size, size, size, 0, 0, 0, 0)
     struct.pack_into("<3f", header, 108, _NIFTI_HEADER, 1, 0)
     struct.pack_into("<b", header, 123, _NIFTI_UNITS.get(volume.unit, 0))

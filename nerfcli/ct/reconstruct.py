@@ -98,22 +98,17 @@ class Projector:
 
 
 def start(problem: Problem) -> Fit:
-    """Return a constant volume whose mean line integral is that of the data."""
-    return Fit(torch.full(problem.grid.shape, mean_attenuation(problem)), torch.zeros(3, *problem.grid.shape))
-
-
-def mean_attenuation(problem: Problem) -> float:
-    """Estimate the mean attenuation: the sum of line integrals over the sum of chord lengths, >= 0."""
-    views = torch.arange(problem.geometry.views)
+    """Return a constant volume >= 0: the sum of the line integrals that the data suggest over that of chord lengths."""
     projector = Projector(problem.geometry, problem.grid)
     ones = torch.ones(problem.grid.shape)
     total, length = 0.0, 0.0
-    for view in views:
+    for view in torch.arange(problem.geometry.views):
         suggested = problem.likelihood.suggested(view[None])
         chord = projector.forward(ones, view[None].numpy())
         met = torch.isfinite(suggested) & (chord > 0)
         total, length = total + float(suggested[met].sum()), length + float(chord[met].sum())
-    return max(total / length, 0.0) if length > 0 else 0.0
+    mean = max(total / length, 0.0) if length > 0 else 0.0
+    return Fit(torch.full(problem.grid.shape, mean), torch.zeros(3, *problem.grid.shape))
 
 
 def finer(fit: Fit, grid: VoxelGrid) -> Fit:
