@@ -43,11 +43,7 @@ def load_tensors(path: Path, device: str) -> tuple[dict[str, Tensor], dict[str, 
 
 
 def read_checkpoint(path: Path) -> bytes:
-    """Read a whole file at once, as a running training may replace it in the meantime.
-
-    Raises:
-        UserError: the file is missing or cannot be read.
-    """
+    """Read a whole file at once, as a running training may replace it in the meantime."""
     try:
         return path.read_bytes()
     except FileNotFoundError as error:
@@ -79,11 +75,7 @@ def _unreadable(path: Path, error: Exception) -> UserError:
 
 
 def refuse_non_finite(tensors: dict[str, Tensor], path: Path) -> None:
-    """Refuse weights from which no picture can be rendered.
-
-    Raises:
-        UserError: a tensor holds NaN or infinity; the message names the first one.
-    """
+    """Refuse weights from which no picture can be rendered: NaN or infinity; the message names the first tensor."""
     for name, tensor in tensors.items():
         if count := int((~tensor.isfinite()).sum()):
             raise UserError(

@@ -33,10 +33,6 @@ def exposed(rgb: Tensor, log_gains: Tensor) -> Tensor:
 
     srgb(exp(log_gain) * linear(rgb)), channel by channel
 
-    Args:
-        rgb: (..., 3) sRGB >= 0.
-        log_gains: broadcastable to rgb; 0 changes only the last bits.
-
     Differentiable in both.
     """
     return srgb_from_linear(linear_from_srgb(rgb) * log_gains.exp())

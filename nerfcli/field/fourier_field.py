@@ -85,10 +85,6 @@ def fourier_features(x: Tensor, octaves: int) -> Tensor:
 
     gamma(x) = [sin(pi x), cos(pi x), ..., sin(2^(octaves - 1) pi x), cos(2^(octaves - 1) pi x)]
 
-    Args:
-        x: (..., D).
-        octaves: number of frequencies, >= 1.
-
     Returns:
         (..., D * 2 * octaves): component after component, octave after octave, sine before cosine.
 

@@ -66,7 +66,6 @@ def chosen_size(
     level are at most as large as the footprint, all within the limits above. The memory sets the number of parameters.
 
     Args:
-        kind: one of `kinds.KINDS`.
         hash_grid: settings of a hash grid, whose `contraction` and `view_degree` hold for every kind; its `log2_rows`
             is replaced if `memory_bytes` is given.
         footprint: width of a pixel at the centre of the scene, in units of the training frame, in the median photo.
@@ -112,11 +111,7 @@ def cube_side(contraction: str) -> float:
 
 
 def _largest_within(sizes: Sequence[int], settings: Callable[[int], FieldSettings], memory_bytes: int) -> FieldSettings:
-    """Return the settings of the last of increasing sizes whose parameters fit into the memory, enlarged by `SLACK`.
-
-    Raises:
-        UserError: not even the first one does.
-    """
+    """Return the settings of the last of increasing sizes whose parameters fit into the memory, enlarged by `SLACK`."""
     limit = memory_bytes * (1 + SLACK)
     fitting = bisect_right(sizes, limit, key=lambda size: parameter_bytes(settings(size)))
     if fitting == 0:

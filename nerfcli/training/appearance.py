@@ -57,11 +57,7 @@ class Appearance(nn.Module):
 
     @torch.no_grad()
     def init_background_from_sky(self, sky: Tensor) -> None:
-        """Initialise a learned background with the median colour of the sky, which unseen directions keep.
-
-        Args:
-            sky: (pixels,) bool, the pixels of the pool that show the sky.
-        """
+        """Initialise a learned background, for unseen directions, with the median colour of the pixels of the sky."""
         colours = self._pool.colours[sky]
         if self.background is None or len(colours) == 0:
             return
@@ -130,11 +126,7 @@ class Appearance(nn.Module):
 
 
 def over_background(colours: Tensor, background: Tensor) -> Tensor:
-    """Return measured colours over `background` (R, 3): alpha * rgb + (1 - alpha) * background for RGBA.
-
-    Args:
-        colours: (R, 3) or (R, 4) with straight alpha.
-    """
+    """Return colours (R, 3), or (R, 4) of straight alpha, over a background: alpha rgb + (1 - alpha) background."""
     if colours.shape[-1] == 3:
         return colours
     alpha = colours[:, 3:]

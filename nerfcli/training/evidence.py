@@ -149,12 +149,7 @@ def may_use_points(
 
 
 def collect_evidence(
-    photos: TrainingPhotos,
-    pool: PixelPool,
-    *,
-    settings: TrainSettings,
-    is_new: bool,
-    notify: Callable[[str], None],
+    photos: TrainingPhotos, pool: PixelPool, *, settings: TrainSettings, is_new: bool, notify: Callable[[str], None]
 ) -> Evidence:
     """Return what the components need, each step with what the steps before it have found.
 
@@ -256,12 +251,9 @@ def tracks_of_model(scene: Capture, photos: Sequence[LoadedPhoto]) -> Tracks:
 
 
 def point_depths(tracks: Tracks, pool: PixelPool) -> PointDepths:
-    """Return the usable pixels that see a triangulated point; empty if there are none.
+    """Return the usable pixels that see a triangulated point of tracks in the pool's photos; empty if there are none.
 
     trust = 1 / (1 + (reprojection error / 1 px)^2), in pixels of the training photos
-
-    Args:
-        tracks: of features in the pool's photos.
     """
     surface = triangulate(pool.frames, tracks)
     kept = np.flatnonzero(np.isfinite(surface.misses_px))
@@ -283,12 +275,9 @@ def point_depths(tracks: Tracks, pool: PixelPool) -> PointDepths:
 
 
 def dense_points(dense: Sequence[DenseDepth], pool: PixelPool) -> PointDepths:
-    """Return the usable pixels of a pool whose depth is known from stereo matching or from a sensor.
+    """Return the usable pixels of a pool whose depth in its photos is known from stereo matching or from a sensor.
 
     trust = 1 / (1 + (error / 5 %)^2)
-
-    Args:
-        dense: the depths of each photo of the pool.
     """
     widths = [frame.camera.width for frame in pool.frames]
     firsts = pool.first_pixel.tolist()

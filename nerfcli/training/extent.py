@@ -56,9 +56,6 @@ def contracted_frame(scene: Capture) -> tuple[Similarity, Marching]:
     The unit ball is centred where the cameras look. Its radius is the distance of the median camera, or three quarters
     of the median depth if that is larger: in a room the walls are behind the cameras, and nearly all that the photos
     show would be in contracted space, with steps that grow as the square of the distance.
-
-    Raises:
-        UserError: no camera (see `Capture`).
     """
     depths = _typical_depths(scene)
     centre = _focus(scene, depths)
@@ -87,9 +84,6 @@ def narrow_frame(scene: Capture) -> tuple[Similarity, Marching, float]:
     The unit ball is centred between the cameras and reaches to the nearest depth. Everything visible is in contracted
     space, where a position is a direction and an inverse distance: the depth of cells matches the depth resolution of
     the small parallax of these captures. NeRF uses NDC for this, Mildenhall et al. 2020, appendix C.
-
-    Raises:
-        ValueError: the scene has no depths, see `has_narrow_baseline`.
     """
     depths = _typical_depths(scene)
     if depths is None:
@@ -104,9 +98,6 @@ def object_frame(scene: Capture) -> tuple[Similarity, Marching]:
     """Return similarity and steps for an object in the middle and nothing else.
 
     The unit ball is the smallest that fills every camera's view, and the cube around it is the whole field.
-
-    Raises:
-        UserError: no camera (see `Capture`).
     """
     centre, radius = _object_ball(scene)
     distances = _distances(scene, centre)
@@ -278,11 +269,7 @@ def lacks_depth(scene: Capture, settings: TrainSettings, *, is_object: bool) -> 
 
 
 def choose_extent(scene: Capture, settings: TrainSettings, *, is_object: bool) -> Extent:
-    """Choose the extent for the settings.
-
-    Args:
-        scene: cameras, and points or depth bounds; see `lacks_depth`.
-        is_object: as for `lacks_depth`.
+    """Choose the extent for the settings; for `scene` and `is_object` see `lacks_depth`.
 
     Raises:
         UserError: the requested contraction is "none", and there are too few points to tell where the scene ends.
@@ -315,9 +302,6 @@ class RaySteps:
 
     Gradients are scaled down nearer to a camera than `nearest`: where rays begin, divided by `NEAR_PER_POINT`, at most
     1. That is the distance of the nearest 3D point if the capture has points and no bounds.
-
-    Args:
-        extent: gives the steps of the capture, and its parallax.
     """
 
     def __init__(self, extent: Extent, settings: FieldSettings, device: torch.device):

@@ -206,11 +206,7 @@ class Fitting:
         return StepLosses(weighted, colours, samples)
 
     def settle(self) -> None:
-        """Read the loss of the last step if it is still pending on a GPU.
-
-        Raises:
-            NonFiniteError: as for `advance`.
-        """
+        """Read the loss of the last step if it is still pending on a GPU; raises as `advance` does."""
         self._take_losses(self._sent.take())
 
     def _check(self, losses: StepLosses, whole: Batch, watch: Watch) -> None:

@@ -80,10 +80,7 @@ LOSSES: Mapping[str, Callable[[Shown], Tensor]] = {
 
 
 def colour_losses(rendered: Tensor, measured: Tensor) -> Tensor:
-    """Return the Huber loss of sRGB colours, delta 0.1: quadratic for noise, linear for outliers.
-
-    Args:
-        rendered, measured: (R, 3).
+    """Return the Huber loss of sRGB colours (R, 3), delta 0.1: quadratic for noise, linear for outliers.
 
     Returns:
         (R,) the mean over channels, divided by delta so that its slope is at most 1.

@@ -20,10 +20,7 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class Adam:
-    """Adam and its moments for some tensors.
-
-    Args:
-        parameters: the tensors; a step leaves those without a gradient unchanged.
+    """Adam and its moments for some tensors; a step leaves those without a gradient unchanged.
 
     Source: Kingma and Ba 2015, arXiv:1412.6980, algorithm 1.
     """
@@ -176,7 +173,7 @@ LEAST_TOLD = 6
 
 
 def mean_similarity(before: np.ndarray, after: np.ndarray) -> Similarity:
-    """Return the mean similarity of the motions of cameras, to first order.
+    """Return the mean similarity of the motions of cameras, (P, 4, 4) `world_from_cam`, to first order.
 
     With the rotation w_i of camera i and the translation t_i of its centre c_i, in the world, the rotation w, the
     translation u and the logarithm of the scale s about the mean centre c minimise
@@ -188,9 +185,6 @@ def mean_similarity(before: np.ndarray, after: np.ndarray) -> Similarity:
 
     With `LEAST_TOLD` cameras or more, rotations and translations are weighted by the inverse of their residuals: where
     rotations were wrong and centres right, the centres determine the similarity, and vice versa.
-
-    Args:
-        before, after: (P, 4, 4) `world_from_cam`.
     """
     centres = before[:, :3, 3]
     middle = centres.mean(axis=0)
@@ -258,8 +252,7 @@ class NewtonSteps(nn.Module):
         """Update the curvature from some rays, and return the sum (P, 6) of their gradients.
 
         Args:
-            gradients: (R, 6) of each ray's own loss.
-            losses: (R,) the loss of each ray.
+            gradients, losses: (R, 6) and (R,) of each ray's own loss.
             photos: (R,) the photo index of each ray.
         """
         of_ray = gradients[:, :, None] * gradients[:, None, :] / (2.0 * losses + _LEAST_LOSS)[:, None, None]
@@ -308,11 +301,7 @@ def whitening(jacobian: np.ndarray) -> np.ndarray:
 
 
 class WhitenedAdam(nn.Module):
-    """Adam on N sets of K parameters, each in its whitened coordinates.
-
-    Args:
-        whitenings: (N, K, K), see `whitening`.
-    """
+    """Adam on N sets of K parameters, each in its coordinates by `whitenings` (N, K, K), see `whitening`."""
 
     def __init__(self, whitenings: np.ndarray):
         super().__init__()

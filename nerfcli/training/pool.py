@@ -27,10 +27,6 @@ class BearingTables:
     interpolate them, see `BearingGrids`; None if each photo has the principal point of its table.
 
     Accuracy: an interpolated bearing is off by a fraction of 1 / (8 f) of a pixel, f the focal length in pixels.
-
-    Args:
-        cameras: (P,) of the photos.
-        storage: for the tables, which may be as large as photos.
     """
 
     def __init__(self, cameras: Sequence[Camera], device: torch.device, *, storage: PhotoStorage):
@@ -193,9 +189,6 @@ def pixel_footprint(frames: Sequence[Frame], training_from_scene: Similarity) ->
 
     The footprint is distance / focal length. The distance is at least 1, since cameras inside the unit ball look at
     things about one radius away.
-
-    Args:
-        frames: with the cameras of the downscaled training photos.
     """
     footprints = []
     for frame in frames:
@@ -213,10 +206,7 @@ class PixelPool:
     heights and widths of the photos.
 
     Args:
-        photos: at least one.
-        device: where the pixels are drawn.
         colours: of all photos in one array, if there is such an array already.
-        storage: for arrays as large as the photos.
     """
 
     def __init__(
@@ -365,11 +355,7 @@ class PointDepths:
 
 
 class PointRays:
-    """Pixels at known distances that are added to each step.
-
-    Args:
-        sets: of pixels; the same number is drawn from each set, whatever its size. Empty sets are dropped.
-    """
+    """Pixels at known distances that are added to each step: as many from each set, whatever its size."""
 
     def __init__(self, sets: Sequence[PointDepths], pool: PixelPool):
         self.sets = [depths for depths in sets if len(depths.numbers)]

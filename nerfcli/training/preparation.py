@@ -62,7 +62,6 @@ def prepare(
     Of several processes that train together, each loads the photos, and the first one chooses.
 
     Args:
-        scene: photos, cameras and split.
         run: folder for temporary files that hold what does not fit into memory.
         memory_bytes: limit of resident memory, or of GPU memory.
         begun: decisions of a training that is resumed; None for a new one.
@@ -171,11 +170,7 @@ def _with_points(photos: TrainingPhotos) -> Capture:
 
 
 def _plain_background(photos: TrainingPhotos, settings: TrainSettings, begun: Extent | None) -> list[np.ndarray] | None:
-    """Return the masks of a plain background around an object; None if there is none that the model can show.
-
-    Args:
-        begun: extent of a training that is resumed.
-    """
+    """Return the masks of a plain background around an object; None if there is none that the model can show."""
     found, kind = plain_background(photos.album.photos), settings.components.background
     is_open = settings.model == "auto" and "background" not in settings.fixed
     if found is None or not (is_open or kind in LEARNED_BACKGROUNDS or (kind != "random" and found.is_black)):

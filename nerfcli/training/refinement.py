@@ -28,13 +28,10 @@ _FARTHEST_STEP = 2e-3
 
 
 class PoseRefinement(nn.Module):
-    """The poses of P photos.
+    """The poses of P photos; `poses` (P, 4, 4) are `world_from_cam` as given, in the training frame.
 
     `motions` (P, 4, 4) is `given_from_refined`, in the axes of each camera. A small twist x (6,) moves what a camera
     sees by sqrt(x^T `picture` x) radians, root mean square.
-
-    Args:
-        poses: (P, 4, 4) `world_from_cam` as given, training frame.
     """
 
     def __init__(self, poses: np.ndarray, cameras: Sequence[Camera]):
@@ -78,21 +75,10 @@ class PoseRefinement(nn.Module):
         cam_from_world = torch.from_numpy(self.poses()[:, :3, :3]).transpose(-1, -2)[photos]
         return (cam_from_world @ torch.stack([by_origin, torque], dim=-1)).transpose(-1, -2).flatten(-2)
 
-    def step(
-        self,
-        gradients: Tensor,
-        losses: Tensor,
-        photos: Tensor,
-        plan: CameraPlan,
-        *,
-        rate: float,
-    ) -> None:
+    def step(self, gradients: Tensor, losses: Tensor, photos: Tensor, plan: CameraPlan, *, rate: float) -> None:
         """Take a step against gradients (R, 6) of losses (R,) of rays, and remove the mean similarity of all moves.
 
         Args:
-            gradients, losses: of each ray's own loss.
-            photos: (R,) the photo index of each ray.
-            plan: damping and holding of the step.
             rate: fraction of the full Newton step, in [0, 1].
         """
         so_far = self.motions.numpy()
@@ -246,8 +232,6 @@ class Refinement(nn.Module):
         Args:
             drawn: the rays, from `refine_cameras`, with gradients.
             losses: (R,) the loss of each ray.
-            plan: how cameras learn in this step.
-            factor: of the learning rate.
         """
         by_origin, by_direction, rate = drawn.origins.grad, drawn.directions.grad, factor * plan.rate
         if rate == 0.0 or by_origin is None or by_direction is None:

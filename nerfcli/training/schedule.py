@@ -81,13 +81,7 @@ class Budget:
         return cls(settings.budget_seconds, settings.steps)
 
     def progress(self, step: int, seconds: float, *, before: float = 0.0) -> float:
-        """Return the used fraction: the larger of that of steps and that of time.
-
-        Args:
-            step: number of steps so far.
-            seconds: used so far.
-            before: seconds of these that were used before the first step.
-        """
+        """Return the used fraction: the larger of that of steps and of time, without that `before` the first step."""
         by_time = 0.0
         if self.seconds:
             by_time = (seconds - before) / max(self.seconds - before, LEAST_FOR_STEPS * self.seconds)
@@ -263,11 +257,7 @@ def stride(progress: float, step: int) -> int:
 
 
 def loss_weights(components: Components, point_weight: float) -> dict[str, float]:
-    """Return `StepPlan.weights`.
-
-    Args:
-        point_weight: of known distances, as a multiple of their component.
-    """
+    """Return `StepPlan.weights`; that of known distances is `point_weight` times their component."""
     weights = {
         "colour": 1.0,
         "distortion": components.distortion,

@@ -69,7 +69,6 @@ def judge(base: Sequence[Trial], candidate: Candidate, tried: Sequence[Trial], *
 
     Args:
         base: trials without the change, one per seed.
-        tried: trials with the change, in the same order of seeds.
         by_time: whether the gain must also exceed that of more steps in the same time; with a budget of steps, the
             answer must not depend on the speed of the machine.
     """

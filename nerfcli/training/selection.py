@@ -155,12 +155,7 @@ def _stops(spread: float) -> str:
 
 
 def proposals(start: Components, signs: Diagnostics, facts: Facts) -> tuple[list[Candidate], list[Decision]]:
-    """Return the candidates for a scene, those with the best support first, and decisions on what nothing supports.
-
-    Args:
-        start: components of the model so far.
-        signs: diagnostics of its first training.
-    """
+    """Return the candidates for a scene, those with the best support first, and decisions on what nothing supports."""
     candidates: list[Candidate] = []
     declined: list[Decision] = []
     if start.exposure not in ("matched", "learned"):
@@ -227,10 +222,6 @@ def _without_poses(model: Components) -> Components:
 
 def select(trials: Trials, requested: Components, facts: Facts, budget: Budget) -> Selection:
     """Find the components that a scene needs: those that evidence supports, and candidates that gain in trials.
-
-    Args:
-        requested: the components to keep where nothing supports a change.
-        budget: of all trials together.
 
     Returns:
         The selection; if the budget is too small for a first training of `FEWEST_STEPS`, only what needs no trial.

@@ -63,12 +63,7 @@ class Registration:
 
 @dataclass(frozen=True)
 class SeenPoints:
-    """Points of a photo whose depth is known from photos.
-
-    Args:
-        positions: (N, 2) in the photo, as fractions of width and height.
-        z: (N,) along the optical axis, scene units.
-    """
+    """Points of a photo, as fractions (N, 2) of width and height, whose z (N,), scene units, is known from photos."""
 
     positions: np.ndarray
     z: np.ndarray

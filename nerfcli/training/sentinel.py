@@ -94,12 +94,7 @@ def is_finite(tensor: Tensor) -> bool:
 
 
 class Sentinel:
-    """Takes the steps of a training, and handles non-finite numbers.
-
-    Args:
-        fitting: the training, in a state that is finite.
-        run: folder for states before failures.
-    """
+    """Takes the steps of a training, and handles non-finite numbers."""
 
     def __init__(self, fitting: Fitting, *, run: Path, notify: Callable[[str], None]):
         self._fitting = fitting
@@ -123,11 +118,7 @@ class Sentinel:
             return self._recover()
 
     def settle(self) -> None:
-        """Make sure that the last step was finite, too, which `advance` does not know yet on a GPU.
-
-        Raises:
-            UserError: as for `advance`.
-        """
+        """Make sure that the last step was finite, too, which on a GPU `advance` does not know yet; raises as that."""
         try:
             self._fitting.settle()
         except NonFiniteError:

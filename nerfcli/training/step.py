@@ -94,7 +94,6 @@ class StepLosses:
     Args:
         weighted: the losses, each times its weight, () by name.
         colours: (R,) the loss of each ray's colour.
-        samples: number of samples.
     """
 
     weighted: dict[str, Tensor]
@@ -161,12 +160,7 @@ def _shown(state: State, batch: Batch, seen: RaySums, plan: StepPlan) -> Shown:
 
 
 def update(state: State, batch: Batch, losses: StepLosses, plan: StepPlan, *, rate_factor: float) -> None:
-    """Take the optimisers' steps against the gradients of a step.
-
-    Args:
-        batch, losses: of all rays of the step.
-        rate_factor: of all learning rates.
-    """
+    """Take the optimisers' steps against the gradients of a step."""
     rate = rate_factor * plan.learning_rate
     state.optimiser.step(plan.step + 1, rate, decay=row_decay(state, batch.rays))
     state.parts_optimiser.step(rate)

@@ -92,7 +92,6 @@ class InFiles:
     """Storage in files without a name, which vanish with the process, however it ends.
 
     Args:
-        folder: of the files, on a disk with enough room.
         limit: bytes that may be resident.
     """
 
@@ -102,11 +101,7 @@ class InFiles:
         self._maps = weakref.WeakSet[mmap.mmap]()  # a file goes with its array
 
     def array(self, shape: tuple[int, ...], dtype: np.dtype | type) -> np.ndarray:
-        """Return an array to be filled.
-
-        Raises:
-            UserError: the disk is full.
-        """
+        """Return an array to be filled."""
         size = max(1, int(np.prod(shape)) * np.dtype(dtype).itemsize)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -161,7 +156,6 @@ def storage_for(needs: MemoryNeeds, limit: int | None, *, folder: Path) -> tuple
     """Choose the storage of the photos, and a message for the user.
 
     Args:
-        needs: of all photos and the field.
         limit: bytes that may be resident; None for no limit.
 
     Raises:

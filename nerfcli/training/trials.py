@@ -59,9 +59,7 @@ def explained_by_direction(directions: Tensor, colours: Tensor, photos: Tensor) 
     predict those with odd ones, their neighbours, which see the same part of a sky.
 
     Args:
-        directions: (N, 3) unit directions of rays.
-        colours: (N, 3) sRGB.
-        photos: (N,) the indices of their photos.
+        directions, colours, photos: (N, 3) unit, (N, 3) sRGB, and (N,) the indices of their photos.
 
     Returns:
         PSNR in dB of one colour, and of a colour by direction; infinite if either half has too few pixels.
@@ -170,14 +168,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class TrialStart:
-    """State of the first training when it stopped.
-
-    Args:
-        tensors, description: its state.
-        seconds: how long it took.
-        trial: its result.
-        signs: diagnostics from its residuals.
-    """
+    """State of the first training when it stopped, the seconds that it took, its result, and what it shows."""
 
     tensors: dict[str, Tensor]
     description: dict[str, Any]
@@ -270,7 +261,6 @@ class Trials:
         """Continue from `start` to the end of the schedule with other components, and measure.
 
         Args:
-            start: from `begin`.
             components: of the model from here on. New parts begin so that they change nothing: new harmonics with no
                 weight, exposures as in the residuals.
             seed: of everything random; candidates with the same seed draw the same pixels.

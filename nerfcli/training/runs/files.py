@@ -76,11 +76,7 @@ class TrainingSummary:
 
 
 def append_log(run: Path, entry: LogEntry) -> None:
-    """Append a line to RUN/log.jsonl.
-
-    Raises:
-        UserError: it cannot be written.
-    """
+    """Append a line to RUN/log.jsonl."""
     try:
         with (run / LOG).open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry, allow_nan=False) + "\n")

@@ -133,11 +133,7 @@ class RunConfig:
 
 
 def write_config(run: Path, config: RunConfig) -> None:
-    """Write RUN/config.json.
-
-    Raises:
-        UserError: it cannot be written.
-    """
+    """Write RUN/config.json."""
     write_sealed(run / CONFIG, config.to_json())
 
 
@@ -183,13 +179,9 @@ _KEPT = ("contraction", "seed", "log2_rows", "field", "field_memory_bytes")
 
 
 def continued(run: Path, settings: TrainSettings, *, before: RunConfig) -> TrainSettings:
-    """Return the settings with which a training goes on: its own, except for those that are given.
+    """Return the settings with which the training of a run goes on: its own, except for those that are given.
 
     Limits, device and threads are always those given; any other setting with its default counts as not given.
-
-    Args:
-        run: the folder of the training.
-        before: its configuration.
 
     Raises:
         UserError: components, or settings that it keeps, are given and differ.
@@ -209,13 +201,7 @@ def continued(run: Path, settings: TrainSettings, *, before: RunConfig) -> Train
 
 
 class Run:
-    """A run folder; each file is read on first use.
-
-    Args:
-        path: the folder; it is not read yet.
-
-    Every property raises a UserError if its file is missing or damaged.
-    """
+    """A run folder; each file is read on first use. A property raises a UserError if its file is missing or damaged."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -295,11 +281,7 @@ class Run:
         return load_model(self.field_path, device)
 
     def checkpoint_sha256(self) -> str:
-        """Return the hash of the field's file, which identifies the field in metrics, renders and pages.
-
-        Raises:
-            UserError: the file cannot be read.
-        """
+        """Return the hash of the field's file, which identifies the field in metrics, renders and pages."""
         try:
             return hashlib.sha256(self.field_path.read_bytes()).hexdigest()
         except OSError as error:
@@ -307,22 +289,14 @@ class Run:
             raise UserError(f"{self.field_path} cannot be read: {error.strerror}", hint) from error
 
     def metrics(self) -> dict[str, Any] | None:
-        """Return the metrics written by `evaluate`; None if there are none.
-
-        Raises:
-            UserError: the file is damaged.
-        """
+        """Return the metrics written by `evaluate`; None if there are none."""
         if not self.metrics_path.exists():
             return None
         hint = "evaluate again: nerfcli evaluate RUN --overwrite"
         return read_json(self.metrics_path, needed=("mean",), hint=hint)
 
     def check_split(self) -> None:
-        """Check that the held-out photos of the cameras are those that were held out of the training.
-
-        Raises:
-            UserError: they differ.
-        """
+        """Check that the held-out photos of the cameras are those that were held out of the training."""
         if self.config.split_sha256 != split_hash(frame.name for frame in self.cameras.test):
             raise UserError(
                 f"the held-out photos in {self.path / CAMERAS} differ from those recorded in {CONFIG} (split_sha256)",
@@ -361,11 +335,7 @@ class Run:
         return by_time or by_steps
 
     def saved_progress(self) -> tuple[int, float]:
-        """Return the steps and training seconds of the last checkpoint.
-
-        Raises:
-            UserError: it cannot be read.
-        """
+        """Return the steps and training seconds of the last checkpoint."""
         _, description = load_tensors(self.path / STATE, "cpu")
         return description["step"], description["totals"]["seconds"]
 
