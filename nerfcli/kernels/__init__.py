@@ -38,11 +38,7 @@ from nerfcli.version import __version__
 
 
 def backend_for(device: torch.device, dtype: torch.dtype) -> Backend:
-    """Choose the fastest backend that supports a field, and warn once if the fast one of its device does not work.
-
-    Args:
-        device, dtype: of the field's parameters.
-    """
+    """Choose the fastest backend that supports a field, and warn once if the fast one of its device does not work."""
     # float64 fields are for comparison with the reference: no warning is due that they run on plain torch.
     if device.type == "cuda" and dtype != torch.float64:
         why_not = triton_unavailable_reason(device)
@@ -163,11 +159,7 @@ def _numba_cpu() -> ModuleType | None:
 
 
 def describe_machine(processors: int) -> dict[str, Any]:
-    """Return the GPUs, the versions and the backend that runs on each device, as plain values.
-
-    Args:
-        processors: number of processors that this process may use.
-    """
+    """Return the GPUs, the versions and the backend that runs on each device, as plain values."""
     described: dict[str, Any] = {
         "nerfcli": __version__,
         "python": platform.python_version(),

@@ -23,13 +23,7 @@ class _BoundedExp(torch.autograd.Function):
 
 
 def density_from_log(log_density: Tensor) -> Tensor:
-    """Return exp(x) with x clipped to [-15, 15], and with a gradient that never vanishes or overflows.
-
-    Args:
-        log_density: x, any shape, finite.
-
-    Returns:
-        density in [3e-7, 3.3e6], in 1 / unit of the training frame.
+    """Return the density exp(x) in 1 / training unit, x clipped to [-15, 15], with a gradient that never vanishes.
 
     The gradient is the density itself, even beyond the limits: a plain clamp would trap values beyond them forever.
     """
@@ -49,10 +43,7 @@ class _Opacity(torch.autograd.Function):
 
 
 def opacity(optical_depth: Tensor) -> Tensor:
-    """Return 1 - exp(-x) at full precision for small x, with a gradient exp(-x) at full precision for large x.
-
-    Args:
-        optical_depth: x, any shape, >= 0.
+    """Return 1 - exp(-x) at full precision for small x >= 0, with a gradient exp(-x) at full precision for large x.
 
     torch computes the gradient of expm1 as its value plus 1, which cancels to 0 where x is above 17 in float32, or
     above 37 in float64.

@@ -38,9 +38,6 @@ class Backend:
     `name` is its name in descriptions of the machine and in messages; `deterministic` says whether the same inputs
     always give the same bits; `operations` are the single operations on packed samples, as `reference` defines them.
     Subclasses differ in these, and in how they sample and evaluate a hash grid.
-
-    Args:
-        device: of its tensors; on a GPU, sums are added in varying order, and results do not repeat to the bit.
     """
 
     name: str = "reference"
@@ -74,7 +71,6 @@ class Backend:
             background: (R, 3) sRGB, without gradient.
             cell_depths: (C, C, C) over the unit cube; raised to the optical depth of the samples, including those
                 left out for their weight, see `keep_largest`.
-            trace: called with intermediate tensors.
 
         Differentiable in origins, directions, the table and the layers.
         """

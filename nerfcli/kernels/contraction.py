@@ -14,15 +14,9 @@ CONTRACTIONS = ("none", "l2")
 
 
 def contract(points: Tensor) -> Tensor:
-    """Map all of space into the ball of radius 2, leaving the unit ball unchanged.
+    """Map all of space, points (..., 3), into the ball of radius 2, leaving the unit ball unchanged.
 
-    contract(x) = x for |x| <= 1, else (2 - 1/|x|) x / |x|
-
-    Args:
-        points: (..., 3) finite; components up to half of the dtype's largest number.
-
-    Returns:
-        (..., 3) with norm at most 2.
+    contract(x) = x for |x| <= 1, else (2 - 1/|x|) x / |x|, for components up to half of the dtype's largest number
 
     Differentiable everywhere, even at 0: norms below 1 are raised to 1, so that no gradient passes through a root at 0.
     Source: Barron et al. 2022, Mip-NeRF 360, arXiv:2111.12077, eq. 10.
@@ -36,14 +30,9 @@ def contract(points: Tensor) -> Tensor:
 
 
 def grid_coordinates(points: Tensor, contraction: str) -> Tensor:
-    """Convert points of the training frame to coordinates of the unit cube that holds the field's grids.
+    """Convert points (..., 3) of the training frame to coordinates of the unit cube that holds the field's grids.
 
-    Args:
-        points: (..., 3) training frame.
-        contraction: one of `CONTRACTIONS`.
-
-    Returns:
-        (..., 3); within [0, 1] for every point or, without contraction, only for points in [-1, 1]^3.
+    These are within [0, 1] for every point or, without contraction, only for points in [-1, 1]^3.
 
     Raises:
         ValueError: there is no such contraction.
@@ -58,18 +47,10 @@ def grid_coordinates(points: Tensor, contraction: str) -> Tensor:
 
 
 def cube_widths(points: Tensor, widths: Tensor, contraction: str) -> Tensor:
-    """Compute the width of a pixel's footprint at points, in coordinates of the cube of `grid_coordinates`.
+    """Compute the width (N,) of a pixel's footprint at points (N, 3), in coordinates of the cube of `grid_coordinates`.
 
     Widths are scaled as lengths across the line from the centre, along which distant points are seen: by 1/2 without
     contraction, else by 1/4 of (2 - 1/m) / m, where m is the norm of the point, at least 1.
-
-    Args:
-        points: (N, 3) training frame.
-        widths: (N,) width of a pixel at the points, in units of the training frame.
-        contraction: one of `CONTRACTIONS`.
-
-    Returns:
-        (N,).
     """
     if contraction == "none":
         return widths / 2.0

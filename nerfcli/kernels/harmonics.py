@@ -7,16 +7,9 @@ from torch import Tensor
 
 
 def spherical_harmonics(directions: Tensor, degree: int = 3) -> Tensor:
-    """Return the 16 real spherical harmonics of degree 0 to 3, orthonormal on the sphere.
+    """Return the 16 real spherical harmonics of unit directions (..., 3), orthonormal; 0 above the degree.
 
-    Args:
-        directions: (..., 3) unit norm.
-        degree: 0 to 3; the harmonics above it are 0.
-
-    Returns:
-        (..., 16), ordered by degree l, then by order m = -l .. l, with the Condon-Shortley phase left out.
-
-    Differentiable.
+    They are ordered by degree l, then by order m = -l .. l, with the Condon-Shortley phase left out. Differentiable.
     Source: Sloan 2013, Efficient spherical harmonic evaluation, JCGT 2(2), appendix A2.
     """
     x, y, z = directions.unbind(-1)

@@ -29,11 +29,7 @@ def _back_from_cube(x: Any, y: Any, z: Any, contraction: Any, a: Any, b: Any, c:
     # In units of the norm, as squares of distant coordinates would overflow.
     u, v, w = x * inverse, y * inverse, z * inverse
     along = two * inverse * (inverse - one) * (u * a + v * b + w * c)
-    return (
-        (scale * a + along * u) * quarter,
-        (scale * b + along * v) * quarter,
-        (scale * c + along * w) * quarter,
-    )
+    return ((scale * a + along * u) * quarter, (scale * b + along * v) * quarter, (scale * c + along * w) * quarter)
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")

@@ -122,11 +122,7 @@ def chunks_near(walk: Any, space: Any, ray: Any, first: Any, numbers: Any, neede
 
     The cube around a point that reaches to the nearest occupied block is empty. Coordinates of the unit cube change by
     at most 1/2 per unit of distance; where space is contracted, as in `contraction.cube_widths`, most where the ray is
-    nearest to the origin.
-
-    Args:
-        walk, space: a `Walk` and its `EmptySpace`.
-        numbers, needed: scratch space of WINDOW int32 and WINDOW float32.
+    nearest to the origin. `numbers` and `needed` are scratch space.
     """
     half, quarter, one, two = np.float32(0.5), np.float32(0.25), np.float32(1), np.float32(2)
     side, width, contraction, found = space.side, space.width, walk.contraction, 0

@@ -26,9 +26,6 @@ def similarity_gradient(image: np.ndarray, target: np.ndarray) -> np.ndarray:
     SSIM = (2 x y + C1) (2 cov + C2) / ((x^2 + y^2 + C1) (var x + var y + C2)), with means x and y, variances and
     covariance under a window. Beyond its border, a picture is black.
 
-    Args:
-        image, target: (H, W, 3) float32 sRGB.
-
     Source: Wang et al. 2004, Image quality assessment, IEEE TIP 13(4).
     """
     shape, rows = image.shape, (image.shape[0], 3 * image.shape[1])

@@ -59,9 +59,6 @@ def _by_distance(footprints: Any, boxes: Any) -> Any:
 def into_tiles(footprints: Any, boxes: Any, width: Any, height: Any) -> Any:
     """Sort the Gaussians that are seen, and list those of each tile.
 
-    Args:
-        footprints, boxes: see `splat_projection.project`.
-
     Returns:
         order (V,) int32 of the Gaussians that are seen, nearest first; their footprints (V, FOOTPRINT) and boxes
         (V, 4); starts (tiles + 1,) of each tile in the entries; entries (E,) int32, places in the order, nearest first;

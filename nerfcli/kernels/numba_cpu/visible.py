@@ -81,7 +81,6 @@ def fill_round(walk: Any, space: Any, coming: Any, last_ray: Any, lanes: Any, lo
     """Find the next samples of the rays in the lanes, up to AHEAD each; a lane without a ray takes the ray `coming`.
 
     Args:
-        walk, space: a `Walk` and its `EmptySpace`.
         lanes, look, samples: of `new_round`; the samples are written to the last.
 
     Returns:

@@ -16,19 +16,16 @@ def ray_indices(offsets: Tensor) -> Tensor:
 
 
 def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> Tensor:
-    """Return the optical depth between the ray's origin and the near end of each interval.
+    """Return the optical depth (N,) between the ray's origin and the near end of each interval.
 
     tau_i = sum_{j < i} density_j * length_j over the samples of the same ray.
 
     Shifted, then accumulated: subtracting the interval's own depth from the sum loses all digits if it is much denser.
 
     Args:
-        density: (N,) >= 0, finite, in 1 / unit of length.
-        lengths: (N,) >= 0.
-        offsets: (R + 1,).
+        density, lengths: (N,) >= 0, finite.
 
-    Returns:
-        (N,), 0 at the first sample of each ray. Differentiable in density and lengths.
+    Differentiable in density and lengths.
     """
     rays = ray_indices(offsets)
     place = torch.arange(len(density), device=density.device) - offsets[rays]
@@ -39,19 +36,12 @@ def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> T
 
 
 def interval_weights(density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute the fraction of light absorbed in each interval, and the fraction that passes all of them.
+    """Compute the fraction of light absorbed in each interval, (N,), and the fraction that passes all of them, (R,).
 
     alpha_i = 1 - exp(-density_i * length_i),  T_i = exp(-tau_i),  weight_i = T_i * alpha_i
 
-    Args:
-        density: (N,) >= 0, finite.
-        lengths: (N,) >= 0.
-        offsets: (R + 1,).
-
-    Returns:
-        weights (N,), transmittance (R,) behind the last interval; per ray they sum to 1.
-
-    Differentiable in density and lengths. alpha is computed by expm1: 1 - exp loses all digits below 1e-7 in float32.
+    Per ray they sum to 1. Differentiable in density and lengths (N,), >= 0 and finite. alpha is computed by expm1: 1 -
+    exp loses all digits below 1e-7 in float32.
     Source: Max 1995, Optical models for direct volume rendering; Mildenhall et al. 2020, arXiv:2003.08934, eq. 3.
     """
     before = optical_depth_before(density, lengths, offsets)
@@ -74,10 +64,7 @@ def composite(
     colour = sum_i weight_i * rgb_i + T * background; see `interval_weights`.
 
     Args:
-        density: (N,) >= 0, finite.
         rgb: (N, 3).
-        lengths: (N,) >= 0.
-        offsets: (R + 1,).
         background: (R, 3) or (3,).
 
     Returns:

@@ -12,12 +12,7 @@ from torch import Tensor
 
 from nerfcli.kernels.activations import opacity
 from nerfcli.kernels.interface import RayTermination
-from nerfcli.kernels.reference.compositing import (
-    interval_weights,
-    optical_depth_before,
-    ray_indices,
-    sum_along_rays,
-)
+from nerfcli.kernels.reference.compositing import interval_weights, optical_depth_before, ray_indices, sum_along_rays
 
 # Below this optical depth the mean position is taken from its series, whose next term is then at most 5e-14.
 SERIES_BELOW = 0.25
@@ -35,9 +30,6 @@ def mean_fraction(optical_depth: Tensor) -> Tensor:
     """Compute the mean position of absorption within an interval of constant density, as a fraction of the interval.
 
     g(x) = 1/x - 1/(exp(x) - 1), written as 1/x - exp(-x) / (1 - exp(-x)); 1/2 at 0, 1/x at infinity.
-
-    Args:
-        optical_depth: density * length, >= 0.
 
     Returns:
         The same shape, in (0, 1/2]. Relative error of a few units of the dtype's precision everywhere.
@@ -59,9 +51,6 @@ def variance_fraction(optical_depth: Tensor) -> Tensor:
     """Return the variance of the position of absorption within an interval, in squared lengths of the interval.
 
     h(x) = -g'(x) = 1/x^2 - exp(-x) / (1 - exp(-x))^2; 1/12 at 0, 1/x^2 at infinity; see `mean_fraction`.
-
-    Args:
-        optical_depth: density * length, >= 0.
 
     Returns:
         The same shape, in (0, 1/12]. Relative error of about ten units of the dtype's precision everywhere.

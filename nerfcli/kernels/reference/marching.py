@@ -13,12 +13,9 @@ from nerfcli.kernels.reference.networks import density
 
 
 def march(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor]:
-    """Cut rays into intervals and keep those whose midpoint lies in an occupied cell.
+    """Cut rays into intervals and keep those whose midpoint lies in an occupied cell: starts (N,), ends (N,), offsets.
 
     Ray r is cut at edges[k] + jitter[r] * (edges[k + 1] - edges[k]).
-
-    Returns:
-        starts (N,), ends (N,), offsets (R + 1,).
     """
     edges, occupied = along.edges, along.occupied
     cuts = edges[:-1] + rays.jitter[:, None] * (edges[1:] - edges[:-1])  # (R, S + 1)
@@ -65,11 +62,7 @@ def ray_gradients(
 
 
 def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the samples of `march` with their coordinates.
-
-    Returns:
-        starts (N,), ends (N,), coordinates (N, 3) in the field's unit cube, offsets (R + 1,).
-    """
+    """Return the samples of `march` with their coordinates: starts, ends, coordinates (N, 3), offsets."""
     starts, ends, offsets = march(rays, along)
     coordinates = sample_coordinates(
         rays.origins, rays.directions, starts, ends, offsets=offsets, contraction=along.contraction
@@ -78,12 +71,11 @@ def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, 
 
 
 def keep_largest(cells: Tensor, coordinates: Tensor, values: Tensor) -> None:
-    """Raise each cell of a grid over the unit cube to the largest value at the points inside it; NaN is ignored.
+    """Raise each cell of a grid (C, C, C) to the largest value at the points in it, in place; NaN is ignored.
 
     Args:
-        cells: (C, C, C), indexed [z, y, x]; changed in place.
-        coordinates: (N, 3) in the unit cube.
-        values: (N,).
+        cells: indexed [z, y, x].
+        coordinates, values: (N, 3) in the unit cube, and (N,).
     """
     side = len(cells)
     x, y, z = (coordinates * side).long().clamp(0, side - 1).unbind(-1)

@@ -12,33 +12,23 @@ def geometry(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
 
 
 def density(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
-    """Return the density of encoded positions.
+    """Return the density (N,) of encoded positions (N, E).
 
-    density = exp((W2 relu(W1 x))_0), the exponent clipped to [-15, 15]; see `density_from_log`.
-
-    Args:
-        encoded: (N, E).
-        weights: W1 (H, E), W2 (G, H); any further layers are ignored.
-
-    Returns:
-        (N,).
+    density = exp((W2 relu(W1 x))_0), the exponent clipped to [-15, 15]; see `density_from_log`. Layers after W1 (H, E)
+    and W2 (G, H) are ignored.
     """
     return density_from_log(geometry(encoded, weights)[:, 0])
 
 
 def radiance(encoded: Tensor, harmonics: Tensor, rays: Tensor, weights: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    """Return density and colour of encoded positions seen along rays.
+    """Return density (N,) and colour (N, 3), in (0, 1), of encoded positions seen along rays.
 
     g = W2 relu(W1 x),  density = exp(g_0),  rgb = sigmoid(C3 relu(C2 relu(C1 [g, harmonics of the ray])))
 
     Args:
-        encoded: (N, E).
-        harmonics: (R, S) encoded direction of each ray.
+        encoded, harmonics: (N, E), and (R, S) encoded direction of each ray.
         rays: (N,) int64, the ray of each sample.
         weights: W1 (H, E), W2 (G, H), C1 (H, G + S), C2 (H, H), C3 (3, H); no biases.
-
-    Returns:
-        density (N,), rgb (N, 3) in (0, 1).
 
     Differentiable in encoded, harmonics and weights.
     """

@@ -8,10 +8,9 @@ from nerfcli.kernels.interface import PixelTable
 
 
 def pixel_rays(chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the rays of chosen pixels (N,) int64 of many photos, and their colours.
+    """Return origins (N, 3), directions (N, 3) and colours (N, C) in [0, 1] of chosen pixels (N,) int64 of many photos.
 
-    Returns:
-        origins (N, 3), directions (N, 3) = rotation @ bearing, colours (N, C) in [0, 1].
+    directions = rotation @ bearing
     """
     photo = torch.searchsorted(pixels.first_pixel, chosen, right=True) - 1
     bearing = _bearings(photo, chosen - pixels.first_pixel[photo], pixels)

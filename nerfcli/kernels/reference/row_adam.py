@@ -17,9 +17,6 @@ def adam_rows(table: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *,
     A row that no sample touched keeps its moments and its value: it neither drifts on old momentum nor decays, and
     costs nothing.
 
-    Args:
-        table, gradient, first, second: (..., F), all of one shape.
-
     Source: Kingma and Ba 2015, Adam, arXiv:1412.6980, algorithm 1; skipping untouched rows as in Müller et al. 2022.
     """
     number, rate, betas, eps, decay = step

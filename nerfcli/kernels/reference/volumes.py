@@ -18,11 +18,9 @@ def project(
     smooth ones. Lines are infinite: the grid has to be between source and detector.
 
     Args:
-        volume: (Z, Y, X).
         origins: (R, 3) points (x, y, z) on the lines.
         directions: (R, 3) of any length but 0.
         first: (x, y, z) centre of the first voxel.
-        size: side of a voxel.
 
     Returns:
         (R,), in units of the volume times `size`.

@@ -140,7 +140,6 @@ def largest_error(values: Any, wanted: Any, *, tiny: float, scale: Any = None) -
     """Return the largest |value - wanted| / max(|wanted|, tiny).
 
     Args:
-        values: tensor, array or numbers, like `wanted` and `scale`.
         wanted: the answers; NaN where undefined.
         tiny: errors of smaller answers are relative to this.
         scale: magnitudes that errors are relative to, instead of |wanted|.

@@ -27,13 +27,9 @@ class Check:
     """One hard case of one operation.
 
     Args:
-        inputs: returns the inputs, rounded to a precision.
-        run: runs a module's operation on the inputs.
-        bound: returns the bounds of values and gradients in a precision.
-        reason: derivation of the bounds.
+        inputs: returns the inputs, rounded to a precision, on which `run` and, by its `formula`, `textbook` operate.
+        bound: returns the bounds of values and gradients in a precision, which `reason` derives.
         precisions: names of the precisions to test.
-        formula: the textbook formula; "" if there is none.
-        textbook: the operation by that formula.
         no_gradient: reason why the compiled operation has no gradient.
     """
 

@@ -20,13 +20,7 @@ INTERPRETED = os.environ.get("TRITON_INTERPRET", "").lower() in ("1", "true", "o
 # The oldest compute capability that Triton supports, and the oldest Triton that these kernels compile with.
 LEAST_CAPABILITY, LEAST_TRITON = (8, 0), (3, 6)
 # Names of types in Triton's signatures.
-TYPES = {
-    torch.float32: "fp32",
-    torch.float16: "fp16",
-    torch.int64: "i64",
-    torch.int32: "i32",
-    torch.uint8: "u8",
-}
+TYPES = {torch.float32: "fp32", torch.float16: "fp16", torch.int64: "i64", torch.int32: "i32", torch.uint8: "u8"}
 # Pointers that are multiples of this allow vector loads.
 ALIGNMENT = 16
 

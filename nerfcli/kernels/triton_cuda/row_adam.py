@@ -35,11 +35,7 @@ def _update(
 
 
 def adam_rows(table: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *, half: Tensor, step: AdamStep) -> None:
-    """See `reference.adam_rows`; float32, rows of 4 features.
-
-    Args:
-        half: of the table's shape, float16; changed rows are copied to it.
-    """
+    """See `reference.adam_rows`; float32, rows of 4 features. Changed rows are copied to `half`, the float16 table."""
     rows = table.numel() // FEATURES
     number, rate, betas, eps, decay = step
     scale, correction = rate / (1 - betas[0] ** number), (1 - betas[1] ** number) ** -0.5
