@@ -67,13 +67,7 @@ def depth_views(
     depth: DepthRequest = DEPTH,
     on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[DepthView]:
-    """Render the views of frames with pinhole cameras; of a panorama, the six faces of a cube.
-
-    Args:
-        frames: frames of the photos, with any lens.
-        max_size: largest longer side of the pictures, pixels.
-        depth: definition of the depth, along the optical axis.
-    """
+    """Render the views of frames with pinhole cameras; of a panorama, the six faces of a cube."""
     views = []
     small_frames = [small for frame in frames for small in _small_pinholes(frame, max_size)]
     for small in small_frames:
@@ -121,14 +115,10 @@ _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 
 
 def surface_colours(model: Model, points: np.ndarray, normals: np.ndarray, *, voxel_size: float) -> np.ndarray:
-    """Return the colours (N, 3) uint8 of surface points, seen from outside along the normals.
+    """Return the colours (N, 3) uint8 of surface points (N, 3), seen from outside along their unit normals (N, 3).
 
     The colour is that of a ray through a few voxels around the surface, excluding everything farther behind. If the
     ray is nearly transparent, it is the field's colour at the point.
-
-    Args:
-        points, normals: (N, 3) in the scene's frame; normals of unit length, outwards.
-        voxel_size: scene units.
     """
     to_training = model.training_from_scene
     # Rays to a surface cover three voxels before and behind it, in 24 steps.

@@ -17,11 +17,7 @@ SUFFIXES = (".ply", ".glb", ".obj")
 
 
 def is_splat_file(path: Path) -> bool:
-    """Return whether a file is a .spz, or a .ply whose points have colours by direction.
-
-    Raises:
-        UserError: the header of a .ply is damaged.
-    """
+    """Return whether a file is a .spz, or a .ply whose points have colours by direction."""
     suffix = path.suffix.lower()
     if not path.is_file() or suffix not in (".spz", ".ply"):
         return False
@@ -29,11 +25,7 @@ def is_splat_file(path: Path) -> bool:
 
 
 def model_facts(path: Path) -> dict[str, Any]:
-    """Return the facts about a file: kind, format, counts, and what nerfcli wrote into it: unit, frame, run, ...
-
-    Raises:
-        UserError: the file is missing or damaged.
-    """
+    """Return the facts about a file: kind, format, counts, and what nerfcli wrote into it: unit, frame, run, ..."""
     if not path.is_file():
         raise UserError(f"{path} does not exist", "give a file that exists")
     match path.suffix.lower():
@@ -87,11 +79,7 @@ def _described(comments: Sequence[str]) -> dict[str, Any]:
 
 
 def read_glb_json(path: Path) -> dict[str, Any]:
-    """Read the JSON of a binary glTF.
-
-    Raises:
-        UserError: it is not a binary glTF, or truncated.
-    """
+    """Read the JSON of a binary glTF."""
     data = path.read_bytes()
     try:
         magic, version, length = struct.unpack_from("<4sII", data)

@@ -155,14 +155,7 @@ _FAR = 1000.0
 
 
 def write_obj(path: Path, mesh: Mesh, *, colours: np.ndarray, description: Mapping[str, Any]) -> None:
-    """Write a mesh as OBJ, atomically, with a colour after each position, which most programs can read.
-
-    Args:
-        colours: (V, 3) uint8 sRGB.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
+    """Write a mesh as OBJ, atomically, with an sRGB colour after each position, which most programs can read."""
     rows = np.concatenate([mesh.vertices, colours / 255.0], axis=1)
     with atomic_path(path) as partial, partial.open("w", encoding="utf-8") as file:
         file.writelines(f"# {line}\n" for line in comments_of(description))
@@ -171,24 +164,12 @@ def write_obj(path: Path, mesh: Mesh, *, colours: np.ndarray, description: Mappi
 
 
 def write_glb(
-    path: Path,
-    mesh: Mesh,
-    *,
-    colours: np.ndarray,
-    y_up_from_frame: np.ndarray,
-    description: Mapping[str, Any],
+    path: Path, mesh: Mesh, *, colours: np.ndarray, y_up_from_frame: np.ndarray, description: Mapping[str, Any]
 ) -> None:
     """Write a mesh as binary glTF 2.0, atomically.
 
     Positions keep their frame; the root node rotates them to glTF's +Y up. Colours are converted to linear light, as
     glTF requires, and the material is unlit because the colours already contain the scene's lighting.
-
-    Args:
-        colours: (V, 3) uint8 sRGB.
-        y_up_from_frame: (3, 3) rotation.
-
-    Raises:
-        UserError: the file cannot be written.
     """
     vertices = mesh.vertices
     middle = vertices.mean(axis=0) if len(vertices) else np.zeros(3)

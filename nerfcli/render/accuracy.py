@@ -41,10 +41,6 @@ def truncation_bounds(picture: RenderedPicture, tolerance: float) -> dict[str, f
 def measure_error(model: TrainedField, frame: Frame, *, depth: DepthRequest | None) -> dict[str, float]:
     """Render the centres of 256 random pixels, always the same ones, with finer and finer intervals.
 
-    Args:
-        frame: camera and pose in the scene's frame.
-        depth: the depth to measure along with the colour.
-
     Returns:
         The number of pixels, and median and 95th percentile (NAME_median, NAME_p95) of the absolute differences
 

@@ -78,12 +78,7 @@ def depth_maps(
     max_size: int = MAX_SIZE,
     on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[DepthMap]:
-    """Render a small map of the median distance for each photo, through its own lens; see `without_steep`.
-
-    Args:
-        max_size: largest longer side of the maps, pixels.
-        on_progress: called with the fraction that is done.
-    """
+    """Render a map of at most `max_size` pixels of the median distance for each photo, through its lens, not steep."""
     maps = []
     for frame in frames:
         small = small_frame(frame, max_size)
@@ -146,9 +141,7 @@ def largest_angle_deg(seen: np.ndarray, points: np.ndarray, centres: np.ndarray)
     """Return the largest angle in degrees between the rays of two cameras that see a point.
 
     Args:
-        seen: (N, views) bool.
-        points: (N, 3).
-        centres: (views, 3) of the cameras.
+        seen, points, centres: (N, cameras) bool, (N, 3), and (cameras, 3).
 
     Returns:
         (N,) float32; 0 where fewer than two see it. Accurate to 0.03 degrees at small angles.
@@ -180,12 +173,7 @@ def small_frame(frame: Frame, max_size: int) -> Frame:
 def with_coverage(
     picture: RenderedPicture, frame: Frame, *, axis: str, photo_depths: Sequence[DepthMap]
 ) -> RenderedPicture:
-    """Return the picture with coverage and parallax of the points at its median depth.
-
-    Args:
-        picture: a picture with median depth.
-        photo_depths: depth maps of all training photos.
-    """
+    """Return a picture with median depth with coverage and parallax, by all photos, of the points at that depth."""
     assert picture.median is not None
     rays, _ = frame.camera.pixel_bearings()
     if axis == "z":

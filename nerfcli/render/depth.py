@@ -94,7 +94,6 @@ def requested(request: DepthRequest, ends: RayTermination, *, background_distanc
 
     Args:
         ends: where light ends, with the quantiles of `fractions(request)`, along the requested axis and in its unit.
-        background_distance: (R,) that of the request, along the same axis and in the same unit.
     """
     moment = torch.where(ends.mean.isnan(), 0.0, ends.mean * ends.opacity)
     match request.convention:

@@ -52,12 +52,7 @@ MOST_AT_A_TIME = 4
 
 
 def render_job(
-    model: Renderable,
-    job: RenderJob,
-    output: Output,
-    *,
-    part: slice | None = None,
-    reporter: Reporter = Reporter(),
+    model: Renderable, job: RenderJob, output: Output, *, part: slice | None = None, reporter: Reporter = Reporter()
 ) -> list[Path]:
     """Render the frames of a job that are missing; without `part`, write the outputs that need all of them, too.
 
@@ -137,11 +132,7 @@ class _Unfinished:
         return self.path / "files"
 
     def create(self, folder: Path) -> None:
-        """Create the folder, for what will become `folder`.
-
-        Raises:
-            UserError: it cannot be created.
-        """
+        """Create the folder, for what will become `folder`."""
         try:
             (self.path / "frames").mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -174,11 +165,7 @@ class _Unfinished:
 
 
 def _render_missing(
-    model: Renderable,
-    job: RenderJob,
-    chosen: Sequence[int],
-    unfinished: _Unfinished,
-    reporter: Reporter,
+    model: Renderable, job: RenderJob, chosen: Sequence[int], unfinished: _Unfinished, reporter: Reporter
 ) -> None:
     """Render the chosen frames that are missing, several at a time; the first exception stops all after their tile."""
     missing = [index for index in chosen if not unfinished.has(job.names[index])]

@@ -37,12 +37,7 @@ BLACK = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class VideoSettings:
-    """Settings of the videos.
-
-    Args:
-        formats: some of `render.files.film.ENCODERS`; a video of each output in each.
-        fps: frames per second.
-    """
+    """Videos of each output in some of `render.files.film.ENCODERS`, with `fps` frames per second."""
 
     formats: tuple[str, ...] = ("mp4",)
     fps: float = 24.0
@@ -178,7 +173,6 @@ class RenderJob:
     """Views, settings and provenance of a rendering job.
 
     Args:
-        frames: cameras and poses in the scene's frame.
         provenance: all else that determines the pictures, such as the run and the hash of its field; plain values.
         photo_depths: depth maps of the training photos, if `RenderSettings.needs_visibility`; the provenance names the
             photos.

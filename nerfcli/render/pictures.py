@@ -68,11 +68,7 @@ def render_picture(
     """Render one frame; the result is bit-identical for any tile size and number of threads.
 
     Args:
-        frame: camera and pose in the scene's frame.
-        background: colour behind everything.
-        depth: the depth to compute along with the colour; None for none.
         tolerance: largest truncation error of a colour channel, in (0, 1]; see `tracing`.
-        on_tile: called after each tile with its number of pixels.
         rays_per_tile: number of rays rendered at a time, which only affects speed and memory; None for the default of
             the device.
 
@@ -190,9 +186,7 @@ def depth_maps_of(
 
     Args:
         ends: where the light of the rays ends, as distances along them.
-        cosines: (R,) of the angles to the optical axis.
         unit: length of a unit of the maps, in that of the distances.
-        valid: (R,) bool, whether there is a ray.
         background_distance: that of the request, in the unit of the distances.
     """
     # There is no z behind the camera.

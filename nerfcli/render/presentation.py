@@ -77,13 +77,6 @@ def preview(depth: np.ndarray, meta: DepthMeta, colours: ColourRange) -> np.ndar
     Depths outside the range have the colours of its ends, as the legend says; pixels that are not finite are hatched
     grey. A picture too narrow for the legend is centred on a wider sheet. The size depends only on the map's shape and
     the other arguments, so all previews of a video have the same size.
-
-    Args:
-        depth: (height, width).
-        colours: the range, in the unit of `meta`.
-
-    Returns:
-        uint8 RGB (height + legend, at least width, 3).
     """
     picture = coloured(depth, colours, COLOURS)
     suffix = " m" if meta.unit == "metre" else ""
@@ -96,11 +89,7 @@ def preview(depth: np.ndarray, meta: DepthMeta, colours: ColourRange) -> np.ndar
 
 
 def coloured(values: np.ndarray, colours: ColourRange, colour_map: str) -> np.ndarray:
-    """Return the false colours of `preview` without the legend, uint8 RGB (height, width, 3).
-
-    Args:
-        colour_map: one of `colours.COLOUR_MAPS`.
-    """
+    """Return the false colours of `preview` without the legend, uint8 RGB (height, width, 3)."""
     valid = np.isfinite(values)
     level = 255 * colours.positions(np.where(valid, values, colours.low))
     picture = levels_of(colour_map).take(np.rint(level, out=level).astype(np.uint8), axis=0)
@@ -158,14 +147,8 @@ def _tick_labels(colours: ColourRange, suffix: str) -> list[str]:
 def write_previews(folder: Path, job: RenderJob, meta: DepthMeta) -> dict[str, ColourRange]:
     """Write a false-colour PNG beside each measured file, with one range per output.
 
-    Args:
-        folder: holds the complete files of every frame.
-
     Returns:
         The range of each measured output, in the unit of `meta`.
-
-    Raises:
-        UserError: a file cannot be read or written.
     """
     ranges = {}
     for output in job.settings.measured:
@@ -200,23 +183,9 @@ def _write_previews_of(output: str, folder: Path, job: RenderJob, meaning: Depth
 
 
 def write_videos(
-    folder: Path,
-    job: RenderJob,
-    meta: DepthMeta,
-    *,
-    ranges: dict[str, ColourRange],
-    notify: Callable[[str], None],
+    folder: Path, job: RenderJob, meta: DepthMeta, *, ranges: dict[str, ColourRange], notify: Callable[[str], None]
 ) -> None:
-    """Write the videos that were ordered, from the pictures in the folder; one picture at a time is in memory.
-
-    Args:
-        folder: holds every picture and preview.
-        job: the rendering job; `job.check` has passed.
-        ranges: colour ranges from `write_previews`, for the videos' comments.
-
-    Raises:
-        UserError: a video cannot be written.
-    """
+    """Write the videos that were ordered, from the pictures in the folder; one picture at a time is in memory."""
     settings = job.settings.video
     if settings is None:
         return

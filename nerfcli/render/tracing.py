@@ -114,12 +114,9 @@ def render_rays(
 
     Args:
         origins, directions: (R, 3) in the training frame, unit directions.
-        background: (3,) or (R, 3) sRGB.
         cuts: (S + 1,) distances at which all rays are cut; by default those of pictures, see `uniform_cuts`.
-        fractions: of light for the quantiles to compute.
         tolerance: bound on the truncation error of a colour, > 0.
         cones: (R,) footprint of each ray per distance, see `kernels.Rays`; None for lines.
-        keep_intervals: whether to return the samples.
     """
     field, cuts = model.field, uniform_cuts(model.marching).to(directions) if cuts is None else cuts
     edges = torch.cat([cuts, cuts[-1:]])  # the last edge is not used, because there is no jitter

@@ -65,12 +65,9 @@ class TrainedField:
         field: the radiance field, on points of the training frame.
         occupied: (G, G, G) bool over the field's unit cube.
         fine: the same over a finer grid, see `training.fine_cells`; None for models without.
-        marching: the steps along rays.
         background: sRGB behind everything, for pictures without alpha.
         training_from_scene: normalisation of the scene to the training frame.
         unit: unit of length of the scene's frame, "arbitrary" or "metre".
-        unit_source: how the metre is known; None where unknown.
-        sha256: SHA-256 of the file that the model was read from.
     """
 
     field: Field

@@ -53,15 +53,7 @@ def frame_meta(
 
 
 def write_maps(picture: RenderedPicture, folder: Path, name: str, *, settings: RenderSettings, meta: DepthMeta) -> None:
-    """Write the maps of a picture in the float formats of `settings`; each file atomically.
-
-    Args:
-        name: file name without suffix, with "/" between folders.
-        meta: the definition of the depth of this frame, see `frame_meta`.
-
-    Raises:
-        UserError: a file cannot be written.
-    """
+    """Write the maps of a picture in the float formats of `settings`; each file atomically."""
     maps = {output: _map_of(picture, output) for output in settings.measured}
     metas = {output: meaning_of(meta, settings.depth, output) for output in maps}
     for file_format in settings.float_formats:
@@ -114,12 +106,6 @@ def write_levels(folder: Path, names: Sequence[str], *, meaning: DepthMeta) -> L
     Levels reach to twice the 99.9 % quantile of all depths, or to the largest depth if
     that is less: otherwise a few rays that end far away would make all levels coarse. Depths beyond are left out of
     these files.
-
-    Args:
-        names: names of the frames, all of which `write_maps` has written.
-
-    Returns:
-        The length of a level in scene units, and the number of pixels that did not fit.
 
     Raises:
         UserError: a depth is so small that it would read as no depth, or a file cannot be written.

@@ -31,11 +31,7 @@ CONVENTION_OF = {
 }
 QUANTITIES = ("depth", *CONVENTION_OF)
 # The unit of quantities that are not lengths.
-UNIT_OF = {
-    "coverage": "photos",
-    "parallax": "degrees",
-    "confidence": "fractions of 1",
-}
+UNIT_OF = {"coverage": "photos", "parallax": "degrees", "confidence": "fractions of 1"}
 
 _IN_WORDS = {
     "conditional": "the mean distance at which light is absorbed, given that it is",

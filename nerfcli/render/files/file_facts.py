@@ -65,11 +65,7 @@ def description_of(path: Path) -> dict[str, Any] | None:
 
 
 def depth_meta_of(path: Path) -> DepthMeta | None:
-    """Return the definition of the depth in a file that nerfcli wrote; None if it states none.
-
-    Raises:
-        UserError: see `description_of`.
-    """
+    """Return the definition of the depth in a file that nerfcli wrote; None if it states none."""
     return _stated(description_of(path))
 
 
@@ -149,9 +145,6 @@ def file_facts(path: Path) -> dict[str, Any]:
     The facts are kind ("depth", "levels", "preview", "picture", "video" or "array"), format, width, height, depth (one
     sentence), meaning (`DepthMeta` as plain values), not_stated, maps (dtype, shape, valid_share, min, median, max of
     each map, in the unit of the meaning) and texts (other text chunks of a PNG).
-
-    Raises:
-        UserError: the file is missing, damaged, or of another kind.
     """
     entries = description_of(path)
     meta = _meta(path, entries)
@@ -173,11 +166,7 @@ def file_facts(path: Path) -> dict[str, Any]:
 
 
 def renders_facts(folder: Path) -> dict[str, Any]:
-    """Return the facts about a folder that `nerfcli render` wrote: kind, frames, outputs, run, depth and meaning.
-
-    Raises:
-        UserError: its description cannot be read.
-    """
+    """Return the facts about a folder that `nerfcli render` wrote: kind, frames, outputs, run, depth and meaning."""
     path = folder / RENDERS
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

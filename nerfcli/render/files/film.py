@@ -34,11 +34,7 @@ _DITHER = "[0:v][1:v]paletteuse=dither=bayer:bayer_scale=4"
 
 
 def check_encoders(formats: Iterable[str]) -> None:
-    """Check that this machine's ffmpeg supports these of `ENCODERS`, before hours of rendering.
-
-    Raises:
-        UserError: there is no ffmpeg, it does not run, or lacks an encoder.
-    """
+    """Check that this machine's ffmpeg supports these of `ENCODERS`, before hours of rendering."""
     ffmpeg = _ffmpeg()
     try:
         listed = subprocess.run([ffmpeg, "-hide_banner", "-encoders"], capture_output=True, check=True, text=True)
@@ -125,11 +121,7 @@ def _encode(frames: Iterable[np.ndarray], output: Path, arguments: list[str], *,
                     ]
                     # In a separate session, so that Ctrl-C does not reach it: this process handles it.
                     process = subprocess.Popen(
-                        command,
-                        stdin=subprocess.PIPE,
-                        stdout=subprocess.DEVNULL,
-                        stderr=log,
-                        start_new_session=True,
+                        command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log, start_new_session=True
                     )
                 if frame.shape != shape:
                     raise ValueError(f"frame must be {shape} as the first one, got {frame.shape}")

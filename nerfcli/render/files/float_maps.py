@@ -35,7 +35,6 @@ def write_npy(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
     """Write a map as .npy, and `meta` beside it under the same name with .json; each file atomically.
 
     Raises:
-        UserError: a file cannot be written.
         ValueError: depth is not float32 (height, width), or meta holds a number that is not finite.
     """
     check_map(depth)
@@ -46,11 +45,7 @@ def write_npy(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """Read the array of a .npy file; nothing in the file is run as code.
-
-    Raises:
-        UserError: the file is missing, damaged, or contains anything but numbers and text.
-    """
+    """Read the array of a .npy file; nothing in the file is run as code."""
     try:
         with path.open("rb") as file:
             return np.lib.format.read_array(file, allow_pickle=False)
@@ -69,7 +64,6 @@ def write_tiff(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
         depth: float32 (height, width); every bit is preserved, including NaN.
 
     Raises:
-        UserError: the file cannot be written.
         ValueError: depth is not float32 (height, width), or meta holds a number that is not finite.
     """
     check_map(depth)
@@ -95,8 +89,7 @@ def read_tiff(path: Path) -> tuple[np.ndarray, DepthMeta]:
     depth, description = read_any_tiff(path)
     if depth.dtype != np.float32 or depth.ndim != 2:
         raise UserError(
-            f"{path} contains {depth.dtype} {depth.shape}, not a float32 depth map",
-            "give a file that nerfcli wrote",
+            f"{path} contains {depth.dtype} {depth.shape}, not a float32 depth map", "give a file that nerfcli wrote"
         )
     try:
         return depth, DepthMeta.from_json(json.loads(description))
@@ -108,11 +101,7 @@ def read_tiff(path: Path) -> tuple[np.ndarray, DepthMeta]:
 
 
 def read_any_tiff(path: Path) -> tuple[np.ndarray, str]:
-    """Read the first page of a TIFF and its ImageDescription, written by any program.
-
-    Raises:
-        UserError: missing or damaged.
-    """
+    """Read the first page of a TIFF and its ImageDescription, written by any program."""
     try:
         with tifffile.TiffFile(path) as tiff:
             page = tiff.pages[0].aspage()
@@ -135,7 +124,6 @@ def write_exr(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> No
         meta: the definition of the depth, or of another map if depth is not among them.
 
     Raises:
-        UserError: the file cannot be written.
         ValueError: a map is not float32, or meta holds a number that is not finite.
     """
     channels: dict[str, np.ndarray] = {}
@@ -161,11 +149,7 @@ def write_exr(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> No
 
 
 def read_exr(path: Path) -> dict[str, np.ndarray]:
-    """Read every channel of the first part by its name, as stored.
-
-    Raises:
-        UserError: missing or damaged.
-    """
+    """Read every channel of the first part by its name, as stored."""
     try:
         content = path.read_bytes()
     except OSError as error:
