@@ -107,9 +107,6 @@ SUFFIXES = (".ply", ".spz")
 def read_splats(path: Path, notify: Callable[[str], None]) -> tuple[Gaussians, dict[str, Any]]:
     """Read Gaussians from a .ply or .spz of any program, in the frame of the file, and nerfcli's description of them.
 
-    Args:
-        notify: called with a line about Gaussians that were left out.
-
     Returns:
         The Gaussians; the description that `write_splats` was given, empty in files of other programs.
 
@@ -132,10 +129,6 @@ def write_splats(
 
     Args:
         description: unit, frame and others, as in `export.meshes`; in a .spz it is the comment of the gzip stream.
-        notify: called with a line about values that the format cannot hold.
-
-    Raises:
-        UserError: the suffix is another, or the file cannot be written.
     """
     if _suffix(path) == ".spz":
         write_spz(path, gaussians, description, notify=notify)
@@ -144,11 +137,7 @@ def write_splats(
 
 
 def splat_facts(path: Path) -> dict[str, Any]:
-    """Return the facts about a file of splats as plain values, for `nerfcli info`.
-
-    Raises:
-        UserError: see `read_splats`.
-    """
+    """Return the facts about a file of splats as plain values, for `nerfcli info`."""
     gaussians, described = read_splats(path, lambda text: None)
     low, high = (np.round(np.quantile(gaussians.means, share, axis=0), 4).tolist() for share in (0.01, 0.99))
     opacities = 1.0 / (1.0 + np.exp(-gaussians.logits.astype(np.float64)))
@@ -175,11 +164,7 @@ def _suffix(path: Path) -> str:
 
 _FULL_WINDOW = "html,body,main,#stage{height:100%;overflow:hidden}main{max-width:none;padding:0}"
 # The viewer in the page compiles WebAssembly, and makes pictures and workers itself.
-_SOURCES = {
-    "script-src": "'unsafe-inline' 'wasm-unsafe-eval'",
-    "img-src": "data: blob:",
-    "worker-src": "blob:",
-}
+_SOURCES = {"script-src": "'unsafe-inline' 'wasm-unsafe-eval'", "img-src": "data: blob:", "worker-src": "blob:"}
 
 
 def write_splat_page(
@@ -196,14 +181,8 @@ def write_splat_page(
 
     Args:
         gaussians: in a frame whose y points down; the viewer's horizon is level in it.
-        run: the folder; the page shows its name.
         world_from_cam: (4, 4) camera of the first view, in that frame; its roll is not kept.
         fov_deg: vertical field of view of the first view, in degrees.
-        background: sRGB in [0, 1].
-        notify: called with a line about values that were clipped.
-
-    Raises:
-        UserError: the file cannot be written.
     """
     centre, forward = world_from_cam[:3, 3], world_from_cam[:3, 2]
     target = centre + _distance(gaussians, world_from_cam, fov_deg) * forward

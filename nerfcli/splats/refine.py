@@ -92,7 +92,6 @@ class SplatPhoto:
     """A photo to refine on.
 
     Args:
-        view: its camera.
         pixels: (H, W, 3 or 4) uint8 sRGB, straight alpha.
         used: (H, W) bool, or None for all pixels.
         levels: (3, 256) float32, what a level of the photo would be at mean exposure.
@@ -118,9 +117,7 @@ class Refinement:
 
     Args:
         rows: see `rows_of`, in the frame of the views.
-        adam: moments and steps of each Gaussian.
         sizes: (N,) unit of the rate of each mean.
-        steps, seconds: so far.
     """
 
     rows: np.ndarray
@@ -178,7 +175,6 @@ def refine(
     Args:
         background: sRGB behind photos without alpha; photos with alpha get a random one at each step.
         beside, share: further pictures, and their share of the steps; see `pictures_beside`.
-        on_step: called with the fraction of the budget that is used.
         is_ended: whether to end before the budget is used, asked before each step.
         notify: called with a line if kernels have to be compiled first, which does not count.
     """
@@ -235,11 +231,7 @@ def loss_gradient(image: np.ndarray, target: np.ndarray, used: np.ndarray | None
 
 
 def refuse_non_finite(rows: np.ndarray) -> None:
-    """Raise if a number is not finite.
-
-    Raises:
-        UserError: a number is NaN or infinite.
-    """
+    """Raise a UserError if a number is NaN or infinite."""
     bad = ~np.isfinite(rows).all(axis=1)
     if bad.any():
         raise UserError(

@@ -37,12 +37,8 @@ def splat_view(frame: Frame, *, splats_from_scene: Similarity, near: float) -> S
     """Return the camera of a frame, in the frame of the splats.
 
     Args:
-        frame: camera and pose in the scene's frame.
         splats_from_scene: to the frame of the splats.
         near: distance below which Gaussians are left out, in that frame.
-
-    Raises:
-        UserError: the picture is a whole sphere.
     """
     pose = splats_from_scene.apply_pose(frame.world_from_cam)
     rotation = np.ascontiguousarray(pose[:3, :3].T)
@@ -139,14 +135,7 @@ NEAR = 0.02
 
 @dataclass(frozen=True)
 class SplatScene:
-    """Gaussians in the scene's frame, with what rendering needs to know.
-
-    Args:
-        gaussians: in the scene's frame.
-        background: sRGB behind the Gaussians.
-        unit: "arbitrary" or "metre".
-        unit_source: how the metre is known; None where unknown.
-    """
+    """Gaussians in the scene's frame, with what rendering needs to know."""
 
     gaussians: Gaussians
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -186,11 +175,6 @@ class SplatScene:
 
         Args:
             background: sRGB, instead of that of the scene.
-            depth: the depth to compute along with the colour; None for none.
-            on_tile: called with the number of pixels when they are done.
-
-        Raises:
-            UserError: the picture is a whole sphere.
         """
         if depth is not None and depth.convention == "background" and depth.background_distance is None:
             raise ValueError("the background convention needs a background distance")

@@ -55,11 +55,7 @@ _ROWS = 2**16
 def write_spz(
     path: Path, gaussians: Gaussians, description: Mapping[str, Any] | None, *, notify: Callable[[str], None]
 ) -> None:
-    """Write Gaussians as .spz version 3, atomically; `notify` is called with what is clipped, see `packed`.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
+    """Write Gaussians as .spz version 3, atomically; `notify` is called with what is clipped, see `packed`."""
     data, note = packed(gaussians)
     with atomic_path(path) as partial:
         partial.write_bytes(_gzipped(data, description))

@@ -100,11 +100,9 @@ def gaussians_of_field(
     """Return at most `count` Gaussians that look like the field from near its training photos, before any refinement.
 
     Args:
-        photos: the training photos, as the field was trained on them.
         pictures: of the field, from cameras that also see what no photo shows.
         degree: of the harmonics, 0 to 3; those above the constant are 0.
         with_gains: whether the field was trained with exposures of photos; if not, their gains are 1.
-        on_progress: called with the fraction of the maps that is done.
     """
     views = [*photos, *pictures]
     maps = field_maps(model, views, count=count, on_progress=on_progress)

@@ -171,10 +171,6 @@ _MOST_PHOTOS = 255
 def seen_cells(model: Model, photos: Sequence[DepthMap]) -> np.ndarray:
     """Return coverage and parallax of the surface in the cells of the unit cube, measured at one point per cell.
 
-    Args:
-        model: its contraction maps the scene to the cube.
-        photos: depths of all training photos.
-
     Returns:
         uint16 (side, side, side), indexed [z, y, x], side from `SIDES`: coverage, at most 255, + 256 times the
         parallax in whole degrees; 0 where no photo sees a surface.

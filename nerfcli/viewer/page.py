@@ -36,12 +36,7 @@ def numbers_of(packed: PackedField, proof: Proof, seen: np.ndarray) -> tuple[dic
 
 
 def page_html(scene: dict[str, Any], numbers: tuple[dict[str, Any], str]) -> str:
-    """Return the text of a page that needs no server.
-
-    Args:
-        scene: see `scene_of`, with the photos of `pictures.page_photos`.
-        numbers: its field, and the proof that the page compares its rendering with, see `numbers_of`.
-    """
+    """Return the text of a page that needs no server."""
     description, elements = numbers
     return _html(scene | description, elements)
 
@@ -65,9 +60,7 @@ def scene_of(
     """Return the plain values that both kinds of page contain.
 
     Args:
-        run: the folder; the page shows its name.
         frames: pinhole frames, at least one; the first view is that of the middle one.
-        photos: entries of `pictures`.
         box: low and high corner of the initial crop box, scene units.
     """
     name, size = run.resolve().name, 1.0 / model.training_from_scene.scale

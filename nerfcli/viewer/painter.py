@@ -46,7 +46,6 @@ class View:
     """View that a page requests.
 
     Args:
-        frame: pinhole camera and pose in the scene's frame.
         quantile: fraction of the light for the requested quantile depth, in (0, 1).
     """
 
@@ -166,11 +165,7 @@ class _Job:
 
 
 class Painter:
-    """Renders views for clients; a new view of a client replaces its previous one after the current tile.
-
-    Args:
-        model: returns the version number of the newest model, and the model.
-    """
+    """Renders views for clients; a new view of a client replaces its previous one after the current tile."""
 
     def __init__(self, model: Callable[[], tuple[int, Model]], *, threads: int):
         self._model = model
@@ -185,9 +180,6 @@ class Painter:
         """Yield the finished tiles of a view: a header of 8 numbers, then three planes of four values per pixel.
 
         The header is stride, x, y, width, height, width and height of the picture, version of the model.
-
-        Raises:
-            UserError: the field cannot be read.
         """
         job = _Job(client, view)
         with self._changed:

@@ -31,12 +31,7 @@ _SAMPLE = 4
 
 @dataclass(frozen=True)
 class PagePhotos:
-    """Photos of a page.
-
-    Args:
-        entries: plain values of each frame.
-        missing: number of photos that are not where the run expects them.
-    """
+    """Entries of the photos of a page, plain values, and the number of those that are not where the run has them."""
 
     entries: list[dict[str, Any]]
     missing: int
@@ -53,7 +48,6 @@ def page_photos(
     """Return the photos of a run, undistorted to pinhole cameras, sorted by name.
 
     Args:
-        exposures: what is known of the exposures of the photos.
         room_bytes: budget for all pictures, as text in the page.
     """
     frames = _sorted(train, test)
@@ -180,11 +174,7 @@ class Proof:
 
 
 def make_proof(model: Model, frames: Sequence[Frame]) -> Proof:
-    """Render the proof of a model: small pinhole pictures of a few frames, spread evenly.
-
-    Args:
-        frames: pinhole frames, at least one.
-    """
+    """Render the proof of a model: small pinhole pictures of a few frames, spread evenly."""
     chosen = chosen_evenly(frames, CAMERAS)
     small = [Frame(frame.name, _small(frame.camera), frame.world_from_cam) for frame in chosen]
     columns = [values for frame in small for values in _maps(model, frame)]

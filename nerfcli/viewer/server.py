@@ -49,12 +49,7 @@ LOCAL = "127.0.0.1"
 
 @dataclass(frozen=True)
 class Address:
-    """Where the server listens.
-
-    Args:
-        host: an address of this machine; the default can be reached only from it.
-        port: None for the first free one from `FIRST_PORT` on.
-    """
+    """Where the server listens; by default only this machine reaches it, at the first free port from `FIRST_PORT`."""
 
     host: str = LOCAL
     port: int | None = None
@@ -62,10 +57,6 @@ class Address:
 
 class PageServer(ThreadingHTTPServer):
     """Serves a show.
-
-    Args:
-        show: the data source.
-        address: where to listen.
 
     Raises:
         UserError: the port is taken, or the address does not exist.
