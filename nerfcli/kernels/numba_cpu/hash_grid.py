@@ -25,6 +25,7 @@ from nerfcli.kernels.numba_cpu.vector import (
     INT,
     INTS,
     LANES,
+    arguments_of,
     dot_rows,
     floats,
     gather_rows,
@@ -94,13 +95,9 @@ def _corners(rows_of: Callable[..., list[Any]]) -> Any:
         index: Any, weight: Any, inside: Any,
     ) -> Any:  # fmt: skip
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            def data(which: int) -> Any:
-                return context.make_array(signature.args[which])(context, builder, args[which]).data
-
-            at, stride, place, apart = (
-                context.cast(builder, args[i], signature.args[i], types.intp) for i in (1, 2, 5, 6)
-            )
-            resolution, rows = (context.cast(builder, args[i], signature.args[i], types.int32) for i in (3, 4))
+            data, integer = arguments_of(context, builder, signature, args)
+            at, stride, place, apart = map(integer, (1, 2, 5, 6))
+            resolution, rows = (integer(i, types.int32) for i in (3, 4))
             coordinates = [
                 builder.load(vector_at(builder, data(0), at, stride, axis, FLOATS), align=4) for axis in range(3)
             ]
@@ -190,9 +187,7 @@ def encode_range(
 ) -> None:
     """Encode all levels of samples first up to last into the flat array `out`, with scratch space of `new_scratch`.
 
-    Args:
-        points: coordinates as from `by_axis`, flattened, with `stride` numbers per axis.
-        table: a `Table`.
+    The flat `points` are coordinates as from `by_axis`, with `stride` numbers per axis.
     """
     index, weight = scratch[1], scratch[2]
     width = table.resolutions.shape[0] * FEATURES

@@ -209,12 +209,9 @@ def _radiance_backward(
     samples = encoded.shape[0]
     tiles = (samples + TILE - 1) // TILE
     for thread in numba.prange(threads):
-        x, h1 = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
-        c0, h2, h3 = (
-            np.empty(TILE * WIDTH, np.float32),
-            np.empty(TILE * WIDTH, np.float32),
-            np.empty(TILE * WIDTH, np.float32),
-        )
+        x, c0 = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
+        h1, h2 = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
+        h3 = np.empty(TILE * WIDTH, np.float32)
         g, g2 = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
         geometry, out = np.empty(TILE * OUT, np.float32), np.empty(TILE * OUT, np.float32)
         g_out = np.empty(TILE * OUT, np.float32)

@@ -20,6 +20,7 @@ from nerfcli.kernels.numba_cpu.vector import (
     INTS,
     LANES,
     LONG,
+    arguments_of,
     floats,
     in_all_lanes,
     ints,
@@ -81,11 +82,8 @@ def _steps(cube_of: Callable[[Any, list[Any]], list[Any]]) -> Any:
         places: Any, cells: Any,
     ) -> Any:  # fmt: skip
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            def data(which: int) -> Any:
-                return context.make_array(signature.args[which])(context, builder, args[which]).data
-
-            ray, first = (context.cast(builder, args[i], signature.args[i], types.intp) for i in (2, 5))
-            side = context.cast(builder, args[6], signature.args[6], types.int32)
+            data, integer = arguments_of(context, builder, signature, args)
+            ray, first, side = integer(2), integer(5), integer(6, types.int32)
             one, begin = ir.Constant(LONG, 1), builder.mul(ray, ir.Constant(LONG, 3))
 
             def of_ray(which: int, axis: int) -> Any:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from nerfcli.kernels.interface import AdamStep
 from nerfcli.kernels.numba_cpu.threads import use_threads
-from nerfcli.kernels.numba_cpu.vector import FLOATS, INTS, LANES, floats, in_all_lanes, ints, of_each
+from nerfcli.kernels.numba_cpu.vector import FLOATS, INTS, LANES, arguments_of, floats, in_all_lanes, ints, of_each
 
 
 def _touched(builder: Any, gradient: Any) -> Any:
@@ -56,9 +56,8 @@ def _step_vector(
     beta2: Any, correction: Any, eps: Any, decay: Any,
 ) -> Any:  # fmt: skip
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        at = context.cast(builder, args[4], signature.args[4], types.intp)
-        arrays = [context.make_array(signature.args[i])(context, builder, args[i]).data for i in range(4)]
-        places = [builder.bitcast(builder.gep(array, [at]), FLOATS.as_pointer()) for array in arrays]
+        data, integer = arguments_of(context, builder, signature, args)
+        places = [builder.bitcast(builder.gep(data(i), [integer(4)]), FLOATS.as_pointer()) for i in range(4)]
         _step(builder, places, args[5:])
         return context.get_dummy_value()
 

@@ -52,13 +52,27 @@ def of_each(builder: Any, name: str, vector: Any) -> Any:
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"{name}.v{LANES}f32"), [vector])
 
 
+def arguments_of(
+    context: Any, builder: Any, signature: Any, args: Any
+) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Return what gives the arguments of an intrinsic by their numbers: data of arrays, and integers of a type."""
+
+    def data(which: int) -> Any:
+        return context.make_array(signature.args[which])(context, builder, args[which]).data
+
+    def integer(which: int, kind: Any = types.intp) -> Any:
+        return context.cast(builder, args[which], signature.args[which], kind)
+
+    return data, integer
+
+
 @intrinsic
 def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        data, _ = arguments_of(context, builder, signature, args)
         byte = ir.PointerType(ir.IntType(8))
-        place = builder.bitcast(builder.gep(data, [args[1]]), byte)
+        place = builder.bitcast(builder.gep(data(0), [args[1]]), byte)
         kind = ir.FunctionType(ir.VoidType(), [byte, *[INT] * 3])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
         read, keep, data_cache = (ir.Constant(INT, value) for value in (0, 3, 1))
@@ -88,13 +102,9 @@ def _row_access(generate: Callable[..., None]) -> Any:
         row_at: Any,
     ) -> Any:  # fmt: skip
         def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            def data(which: int) -> Any:
-                return context.make_array(signature.args[which])(context, builder, args[which]).data
-
-            flat_data, index_data, weight_data, row_data = data(0), data(2), data(3), data(6)
-            offset, at, stride, row_at = (
-                context.cast(builder, args[i], signature.args[i], types.intp) for i in (1, 4, 5, 7)
-            )
+            data, integer = arguments_of(context, builder, signature, args)
+            flat_data, index_data, weight_data, row_data = map(data, (0, 2, 3, 6))
+            offset, at, stride, row_at = map(integer, (1, 4, 5, 7))
             corners = []
             for corner in range(8):
                 place = builder.add(at, builder.mul(stride, ir.Constant(LONG, corner)))
@@ -164,13 +174,9 @@ def _block_product(
         c: Any, c_at: Any, c_row: Any,
     ) -> Any:  # fmt: skip
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            def data(which: int) -> Any:
-                return context.make_array(signature.args[which])(context, builder, args[which]).data
-
-            a_data, b_data, c_data = data(0), data(4), data(8)
-            a_at, a_row, a_step, b_at, b_step, depth, c_at, c_row = (
-                context.cast(builder, args[i], signature.args[i], types.intp) for i in (1, 2, 3, 5, 6, 7, 9, 10)
-            )
+            data, integer = arguments_of(context, builder, signature, args)
+            a_data, b_data, c_data = map(data, (0, 4, 8))
+            a_at, a_row, a_step, b_at, b_step, depth, c_at, c_row = map(integer, (1, 2, 3, 5, 6, 7, 9, 10))
             width = ir.Constant(LONG, LANES)
             cells = [(row, column) for row in range(rows) for column in range(vectors)]
             places, sums = {}, {}
