@@ -27,13 +27,7 @@ from nerfcli.field.exposure import changed_in_front, exposed
 from nerfcli.field.hash_field import HashField
 from nerfcli.photos.colours import psnr_of
 from nerfcli.photos.exif import log_exposures
-from nerfcli.photos.held_out_exposure import (
-    PhotoExposures,
-    exif_slope,
-    gains_between,
-    gains_beyond_exif,
-    log_gains_of,
-)
+from nerfcli.photos.held_out_exposure import PhotoExposures, exif_slope, gains_between, gains_beyond_exif, log_gains_of
 from nerfcli.render.model import Model, save_model
 from nerfcli.render.tracing import render_rays
 from nerfcli.training.appearance import over_background
@@ -63,13 +57,7 @@ class Totals:
 
 
 class Checkpoints:
-    """The files of one training.
-
-    Args:
-        fitting, totals: read when a checkpoint is written.
-        inputs: what the fitting began from.
-        scene: gives the unit of length.
-    """
+    """The files of one training."""
 
     def __init__(self, run: Path, fitting: Fitting, totals: Totals, *, inputs: TrainingInputs, scene: Capture):
         self._run, self._fitting, self._totals = run, fitting, totals
@@ -127,11 +115,7 @@ class Checkpoints:
         return refinement.frames(*given)
 
     def keep_waypoint(self) -> None:
-        """Keep the current field, cameras and exposures until the training is over, see `measure_waypoints`.
-
-        Raises:
-            UserError: they cannot be written.
-        """
+        """Keep the current field, cameras and exposures until the training is over, see `measure_waypoints`."""
         waypoint = _waypoint(self._run, self._fitting.step)
         try:
             waypoint.mkdir(parents=True, exist_ok=True)
@@ -177,26 +161,16 @@ class Checkpoints:
 
 
 def read_checkpoint(run: Path, device: str) -> tuple[tuple[dict[str, Tensor], dict[str, Any]], EarlierDecisions]:
-    """Return the last checkpoint of a run, for `restore`, and the decisions made before it.
+    """Return the last checkpoint of a run, for `Fitting.restore`, and the decisions made before it.
 
     Raises:
-        UserError: there is none, or another version wrote it.
+        UserError: there is none, another version wrote it, or it has numbers that are not finite.
     """
     tensors, description = load_tensors(run / STATE, device)
     if description.get("format") != STATE_FORMAT:
         raise UserError(f"{run / STATE} was written by another version of nerfcli", "train again with --overwrite")
-    return (tensors, description), EarlierDecisions(Extent.from_json(description["extent"]), read_config(run))
-
-
-def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> Totals:
-    """Restore `fitting`, whose field has the checkpoint's size, from the run's last checkpoint.
-
-    Raises:
-        UserError: it has numbers that are not finite.
-    """
     refuse_non_finite(that_must_be_finite(tensors), run / STATE)
-    fitting.restore(tensors, description)
-    return Totals(**description["totals"])
+    return (tensors, description), EarlierDecisions(Extent.from_json(description["extent"]), read_config(run))
 
 
 WAYPOINTS_FOLDER = "waypoints"
@@ -270,10 +244,7 @@ class HeldoutPixels:
         """
         background = colours_behind(model.background, self.directions)
         # All rays at once would take half a gigabyte while space is still full of fog.
-        parts = zip(
-            *(rays.split(512) for rays in (self.origins, self.directions, self.cones, background)),
-            strict=True,
-        )
+        parts = zip(*(rays.split(512) for rays in (self.origins, self.directions, self.cones, background)), strict=True)
         seen = (render_rays(model, *rays, background=behind, cones=cones) for *rays, cones, behind in parts)
         columns = zip(*((one.rgb, 1.0 - one.ends.opacity[:, None]) for one in seen), strict=True)
         rendered, transmittance = map(torch.cat, columns)

@@ -16,14 +16,7 @@ from nerfcli.field.kinds import field_bytes, settings_from_json
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.machine import begin_recent_peak, peak_resident_bytes, use_threads
 from nerfcli.photos.images import write_png
-from nerfcli.training.checkpoints import (
-    Checkpoints,
-    Totals,
-    forget_waypoints,
-    measure_waypoints,
-    read_checkpoint,
-    restore,
-)
+from nerfcli.training.checkpoints import Checkpoints, Totals, forget_waypoints, measure_waypoints, read_checkpoint
 from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.files import (
@@ -47,12 +40,6 @@ def write_left_out(run: Path, inputs: TrainingInputs, *, notify: Callable[[str],
     """Write RUN/occluders/PHOTO.png, black where pixels are left out, for each photo with such pixels.
 
     Held-out photos have those of what is attached to the camera. Occluders are reported.
-
-    Args:
-        run: its folder; masks of an earlier training are replaced.
-
-    Raises:
-        UserError: the masks cannot be written.
     """
     if inputs.occluders is None and not inputs.attached:
         return
@@ -105,14 +92,11 @@ def train(
     The held-out photos are not opened before the last checkpoint has been written.
 
     Args:
-        scene: photos, cameras and split.
         run: the folder to write; must not hold a run unless `resume`.
-        settings: budget, resolution, seed, device.
         resume: go on from the run's last checkpoint to the budget or step count of `settings`, which count from 0, see
             `continued`.
         memory_bytes: limit of resident memory; photos that do not fit are kept in files, and the result is the same. On
             a GPU, limit of its memory, into which everything has to fit.
-        on_progress: called after every step.
 
     Raises:
         UserError: too little memory, unreadable photos, numbers that became non-finite, nothing to resume or other
@@ -133,7 +117,8 @@ def train(
     fitting = Fitting(inputs, size=None if saved is None else settings_from_json(saved[1]["field"]))
     notify(f"field: {fitting.field.settings.size_text}; {field_bytes(fitting.field) / 1e6:.2f} MB")
     if saved is not None:
-        totals = restore(fitting, run, *saved)
+        fitting.restore(*saved)
+        totals = Totals(**saved[1]["totals"])
         cut_log(run, fitting.step)
         forget_waypoints(run, after=fitting.step)
         notify(f"resumed at step {fitting.step}, {totals.seconds:.1f} s")
