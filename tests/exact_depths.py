@@ -8,6 +8,7 @@ import functools
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from itertools import pairwise
+from typing import NamedTuple
 
 from exact_answers import DIGITS
 
@@ -50,8 +51,7 @@ class RayTermination:
     anchor: float
 
 
-@dataclass(frozen=True)
-class _Interval:
+class _Interval(NamedTuple):
     sigma: Decimal
     start: Decimal
     length: Decimal
@@ -68,47 +68,32 @@ class _Interval:
 
 def ray_termination(ray: Ray) -> RayTermination:
     """Return every depth of a ray and its gradient; the ray's numbers are not rounded."""
-    return _ray_termination(_Numbers(ray))
-
-
-class _Numbers:
-    """A cache key: a ray compared by its numbers, not its name, as several precisions and tests share rays."""
-
-    def __init__(self, ray: Ray):
-        self.ray, self._key = ray, (tuple(ray.density), tuple(ray.starts), tuple(ray.ends))
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Numbers) and self._key == other._key
+    with localcontext() as context:
+        context.prec = DIGITS
+        return _ray_termination(_intervals(tuple(ray.density), tuple(ray.starts), tuple(ray.ends)))
 
 
 @functools.cache
-def _ray_termination(numbers: _Numbers) -> RayTermination:
-    ray = numbers.ray
-    with localcontext() as context:
-        context.prec = DIGITS
-        intervals = _intervals(_Numbers(ray))
-        tau = sum((one.depth for one in intervals), Decimal(0))
-        left = (-tau).exp()
-        slopes = [one.length * left for one in intervals]
-        depths = {"opacity": _depth(1 - left, slopes, slopes)}
-        depths["transmittance"] = _depth(left, [-x for x in slopes], slopes)
-        mass = sum((one.weight for one in intervals), Decimal(0))
-        peak = max((one.weight for one in intervals), default=Decimal(0))
-        # Weights this close are equal but for rounding; the nearest of them counts as the heaviest.
-        near = [k for k, one in enumerate(intervals) if one.weight > 0 and one.weight >= peak * (1 - _THIN)]
-        if mass:
-            depths |= _moments(intervals, mass, intervals[near[0]].mean)
-            one = intervals[near[0]]
-            slopes = [-one.variance if k == near[0] else Decimal(0) for k in range(len(intervals))]
-            sizes = [_mean_slope_size(one) if k == near[0] else Decimal(0) for k in range(len(intervals))]
-            depths["max-weight"] = _depth(one.mean, slopes, sizes)
-        else:
-            depths |= dict.fromkeys(("conditional", "spread", "max-weight"), _undefined(ray))
-        depths |= {name: _quantile(ray, intervals, _target(fraction)) for name, fraction in QUANTILES.items()}
-        return RayTermination(depths, float(intervals[near[0]].start) if near else float("nan"))
+def _ray_termination(intervals: tuple[_Interval, ...]) -> RayTermination:
+    tau = sum((one.depth for one in intervals), Decimal(0))
+    left = (-tau).exp()
+    slopes = [one.length * left for one in intervals]
+    depths = {"opacity": _depth(1 - left, slopes, slopes)}
+    depths["transmittance"] = _depth(left, [-x for x in slopes], slopes)
+    mass = sum((one.weight for one in intervals), Decimal(0))
+    peak = max((one.weight for one in intervals), default=Decimal(0))
+    # Weights this close are equal but for rounding; the nearest of them counts as the heaviest.
+    near = [k for k, one in enumerate(intervals) if one.weight > 0 and one.weight >= peak * (1 - _THIN)]
+    if mass:
+        depths |= _moments(intervals, mass, intervals[near[0]].mean)
+        one = intervals[near[0]]
+        slopes = [-one.variance if k == near[0] else Decimal(0) for k in range(len(intervals))]
+        sizes = [_mean_slope_size(one) if k == near[0] else Decimal(0) for k in range(len(intervals))]
+        depths["max-weight"] = _depth(one.mean, slopes, sizes)
+    else:
+        depths |= dict.fromkeys(("conditional", "spread", "max-weight"), _undefined(intervals))
+    depths |= {name: _quantile(intervals, _target(fraction)) for name, fraction in QUANTILES.items()}
+    return RayTermination(depths, float(intervals[near[0]].start) if near else float("nan"))
 
 
 def is_settled(ray: Ray, fraction: float, *, within: float) -> bool:
@@ -118,7 +103,7 @@ def is_settled(ray: Ray, fraction: float, *, within: float) -> bool:
     """
     with localcontext() as context:
         context.prec = DIGITS
-        intervals, target = _intervals(_Numbers(ray)), _target(fraction)
+        intervals, target = _intervals(tuple(ray.density), tuple(ray.starts), tuple(ray.ends)), _target(fraction)
         least, most = (_crossed(intervals, target * (1 + Decimal(x))) for x in (-within, within))
         if least is None or most is None:
             return least is most
@@ -127,12 +112,10 @@ def is_settled(ray: Ray, fraction: float, *, within: float) -> bool:
 
 
 @functools.cache
-def _intervals(numbers: _Numbers) -> list[_Interval]:
-    ray = numbers.ray
+def _intervals(*columns: tuple[float, ...]) -> tuple[_Interval, ...]:
+    """Return the intervals of densities, starts and ends; cached, as several precisions and tests share rays."""
     tau, found = Decimal(0), []
-    for sigma, start, end in zip(
-        *(map(Decimal, values) for values in (ray.density, ray.starts, ray.ends)), strict=True
-    ):
+    for sigma, start, end in zip(*(map(Decimal, values) for values in columns), strict=True):
         length = end - start
         own = sigma * length
         if own < _THIN:
@@ -143,10 +126,10 @@ def _intervals(numbers: _Numbers) -> list[_Interval]:
         passing, through = (-tau).exp(), (-own).exp()
         found.append(_Interval(sigma, start, length, tau, passing * (1 - through), passing * through, mean, variance))
         tau += own
-    return found
+    return tuple(found)
 
 
-def _moments(intervals: list[_Interval], mass: Decimal, place: Decimal) -> dict[str, Depth]:
+def _moments(intervals: tuple[_Interval, ...], mass: Decimal, place: Decimal) -> dict[str, Depth]:
     """Return mean m and spread S, with d w_i / d sigma_k = L_k (T_(k+1) for i = k, -w_i for i > k) and d m_k = -v_k.
 
     d m / d sigma_k = sum_i d w_i (m_i - m) / W - w_k v_k / W
@@ -174,7 +157,7 @@ def _moments(intervals: list[_Interval], mass: Decimal, place: Decimal) -> dict[
     return {"conditional": _depth(mean, slopes, sizes), "spread": _depth(spread, of_spread, spread_sizes)}
 
 
-def _by_weights(intervals: list[_Interval], values: list[Decimal], *, absolute: bool = False) -> list[Decimal]:
+def _by_weights(intervals: tuple[_Interval, ...], values: list[Decimal], *, absolute: bool = False) -> list[Decimal]:
     """Return sum_i values_i d w_i / d sigma_k for each k, or the sum of the terms' absolute values."""
     behind, found = Decimal(0), []
     for one, value in zip(reversed(intervals), reversed(values), strict=True):
@@ -202,11 +185,11 @@ def _variance_slope_size(one: _Interval) -> Decimal:
     return slope if one.depth < _CLOSED_VARIANCE else 2 * (one.length / one.depth) ** 3
 
 
-def _quantile(ray: Ray, intervals: list[_Interval], target: Decimal) -> Depth:
+def _quantile(intervals: tuple[_Interval, ...], target: Decimal) -> Depth:
     """Return t = start + (target - tau) / sigma in the interval k that crosses the target."""
     k = _crossed(intervals, target)
     if k is None:
-        return _undefined(ray)
+        return _undefined(intervals)
     one = intervals[k]
     inside = (target - one.before) / one.sigma
     before = [earlier.length / one.sigma for earlier in intervals[:k]]
@@ -221,7 +204,7 @@ def _target(fraction: float) -> Decimal:
     return -(1 - Decimal(fraction)).ln()
 
 
-def _crossed(intervals: list[_Interval], target: Decimal) -> int | None:
+def _crossed(intervals: tuple[_Interval, ...], target: Decimal) -> int | None:
     """Return the index of the interval in which an optical depth is reached, or None if none reaches it."""
     return next((k for k, one in enumerate(intervals) if one.before + one.depth >= target), None)
 
@@ -230,6 +213,6 @@ def _depth(value: Decimal, gradient: list[Decimal], size: list[Decimal]) -> Dept
     return Depth(float(value), [float(x) for x in gradient], [float(x) for x in size])
 
 
-def _undefined(ray: Ray) -> Depth:
-    zeros = [0.0] * len(ray.density)
+def _undefined(intervals: tuple[_Interval, ...]) -> Depth:
+    zeros = [0.0] * len(intervals)
     return Depth(float("nan"), zeros, zeros)

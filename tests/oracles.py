@@ -19,25 +19,13 @@ def march_through_slabs(density, lengths, rgb, background):
 
 
 def quadrature_of_end_density(density, starts, ends, steps=20000):
-    """Return the integrals of p(t) and t p(t), p = T sigma, for a piecewise constant density, by the midpoint rule."""
-    mass, first = 0.0, 0.0
-    depth = 0.0
+    """Return the integrals of p(t), t p(t) and t^2 p(t), p = T sigma, for a piecewise constant density, by the midpoint
+    rule."""
+    moments, depth = np.zeros(3), 0.0
     for s, t0, t1 in zip(density, starts, ends, strict=True):
         h = (t1 - t0) / steps
         t = t0 + (np.arange(steps) + 0.5) * h
         p = s * np.exp(-(depth + s * (t - t0)))
-        mass += p.sum() * h
-        first += (t * p).sum() * h
+        moments += np.stack([p, t * p, t * t * p]).sum(1) * h
         depth += s * (t1 - t0)
-    return mass, first
-
-
-def quadrature_of_squares(density, starts, ends, steps=20000):
-    """Return the integral of t^2 p(t), as in `quadrature_of_end_density`."""
-    second, depth = 0.0, 0.0
-    for s, t0, t1 in zip(density, starts, ends, strict=True):
-        h = (t1 - t0) / steps
-        t = t0 + (np.arange(steps) + 0.5) * h
-        second += (t * t * s * np.exp(-(depth + s * (t - t0)))).sum() * h
-        depth += s * (t1 - t0)
-    return second
+    return moments
