@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerfcli.kernels.reference.compositing import MOST_DEVIATION
 from nerfcli.kernels.triton_cuda.launch import Size, blocks, jit, launch
-from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, span_of
+from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, load3, own_rays, samples_at, store3
 
 # Distances that a program contracts.
 BLOCK = Size.of(1024, interpreted=4096)
@@ -39,13 +39,10 @@ def thickness(density, lengths, i, valid):
 def _depth_before(
     density, lengths, offsets, out, rays, RAYS: tl.constexpr, STEPS: tl.constexpr
 ):  # fmt: skip
-    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
-    first, last = span_of(offsets, ray, rays)
-    longest = tl.max(last - first, 0).to(tl.int32)
+    _, _, first, last, longest = own_rays(offsets, rays, RAYS)
     depth = tl.zeros([RAYS], tl.float32)
     for step in range(0, longest, STEPS):
-        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
-        valid = i < last[:, None]
+        i, valid = samples_at(first, last, step, STEPS)
         ahead = thickness(density, lengths, i - 1, valid & (i > first[:, None]))
         tl.store(out + i, depth[:, None] + tl.cumsum(ahead, 1), mask=valid)
         depth += tl.sum(ahead, 1)
@@ -56,43 +53,34 @@ def _forward(
     density, rgb, lengths, offsets, background, colour, transmittance, weights,
     rays, COLOURS: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
-    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
-    there = ray < rays
-    first, last = span_of(offsets, ray, rays)
-    longest = tl.max(last - first, 0).to(tl.int32)
+    ray, there, first, last, longest = own_rays(offsets, rays, RAYS)
     depth, total = tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32)
     red, green, blue = (tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32))
     for step in range(0, longest, STEPS):
-        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
-        valid = i < last[:, None]
+        i, valid = samples_at(first, last, step, STEPS)
         own = thickness(density, lengths, i, valid)
         ahead = thickness(density, lengths, i - 1, valid & (i > first[:, None]))
         weight = tl.exp(-(depth[:, None] + tl.cumsum(ahead, 1))) * absorbed(own)
         tl.store(weights + i, weight, mask=valid)
         if COLOURS:
-            red += tl.sum(weight * tl.load(rgb + i * 3, mask=valid, other=0.0), 1)
-            green += tl.sum(weight * tl.load(rgb + i * 3 + 1, mask=valid, other=0.0), 1)
-            blue += tl.sum(weight * tl.load(rgb + i * 3 + 2, mask=valid, other=0.0), 1)
+            r, g, b = load3(rgb, i, valid)
+            red += tl.sum(weight * r, 1)
+            green += tl.sum(weight * g, 1)
+            blue += tl.sum(weight * b, 1)
         depth += tl.sum(ahead, 1)
         total += tl.sum(own, 1)
     left = tl.exp(-total)
     tl.store(transmittance + ray, left, mask=there)
     if COLOURS:
-        red += left * tl.load(background + ray * 3, mask=there, other=0.0)
-        green += left * tl.load(background + ray * 3 + 1, mask=there, other=0.0)
-        blue += left * tl.load(background + ray * 3 + 2, mask=there, other=0.0)
-        tl.store(colour + ray * 3, red, mask=there)
-        tl.store(colour + ray * 3 + 1, green, mask=there)
-        tl.store(colour + ray * 3 + 2, blue, mask=there)
+        r, g, b = load3(background, ray, there)
+        store3(colour, ray, there, red + left * r, green + left * g, blue + left * b)
 
 
 @jit
 def _worth(rgb, by_weight, i, valid, red, green, blue):
-    """Return the derivative of the loss by the weights of samples."""
-    value = tl.load(by_weight + i, mask=valid, other=0.0)
-    value += red * tl.load(rgb + i * 3, mask=valid, other=0.0)
-    value += green * tl.load(rgb + i * 3 + 1, mask=valid, other=0.0)
-    return value + blue * tl.load(rgb + i * 3 + 2, mask=valid, other=0.0)
+    """Return the derivative of the loss by weights, of colours `rgb` and by themselves."""
+    r, g, b = load3(rgb, i, valid)
+    return tl.load(by_weight + i, mask=valid, other=0.0) + red * r + green * g + blue * b
 
 
 @jit
@@ -101,23 +89,14 @@ def _backward(
     by_colour, by_transmittance, by_weight, by_density, by_rgb, rays,
     RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
-    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
-    there = ray < rays
-    first, last = span_of(offsets, ray, rays)
-    longest = tl.max(last - first, 0).to(tl.int32)
-    red = tl.load(by_colour + ray * 3, mask=there, other=0.0)
-    green = tl.load(by_colour + ray * 3 + 1, mask=there, other=0.0)
-    blue = tl.load(by_colour + ray * 3 + 2, mask=there, other=0.0)
+    ray, there, first, last, longest = own_rays(offsets, rays, RAYS)
+    red, green, blue = load3(by_colour, ray, there)
     # Change of the loss by the light that passes: d loss / d T behind the last sample, times that T.
-    behind = tl.load(by_transmittance + ray, mask=there, other=0.0)
-    behind += red * tl.load(background + ray * 3, mask=there, other=0.0)
-    behind += green * tl.load(background + ray * 3 + 1, mask=there, other=0.0)
-    behind += blue * tl.load(background + ray * 3 + 2, mask=there, other=0.0)
+    behind = _worth(background, by_transmittance, ray, there, red, green, blue)
     behind *= tl.load(transmittance + ray, mask=there, other=0.0)
     depth = tl.zeros([RAYS], tl.float32)
     for step in range(0, longest, STEPS):
-        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
-        valid = i < last[:, None]
+        i, valid = samples_at(first, last, step, STEPS)
         own = thickness(density, lengths, i, valid)
         # The transmittance behind the sample, until its gradient replaces it.
         tl.store(by_density + i, tl.exp(-(depth[:, None] + tl.cumsum(own, 1))), mask=valid)
@@ -125,8 +104,7 @@ def _backward(
     tl.debug_barrier()
     blocks = tl.cdiv(longest, STEPS)
     for block in range(blocks):
-        i = first[:, None] + (blocks - 1 - block) * STEPS + tl.arange(0, STEPS)[None, :]
-        valid = i < last[:, None]
+        i, valid = samples_at(first, last, (blocks - 1 - block) * STEPS, STEPS)
         value = _worth(rgb, by_weight, i, valid, red[:, None], green[:, None], blue[:, None])
         weight = tl.load(weights + i, mask=valid, other=0.0)
         further = valid & (i + 1 < last[:, None])
@@ -136,9 +114,7 @@ def _backward(
         length = tl.load(lengths + i, mask=valid, other=0.0)
         passing = tl.load(by_density + i, mask=valid, other=0.0)
         tl.store(by_density + i, length * (passing * value - after), mask=valid)
-        tl.store(by_rgb + i * 3, weight * red[:, None], mask=valid)
-        tl.store(by_rgb + i * 3 + 1, weight * green[:, None], mask=valid)
-        tl.store(by_rgb + i * 3 + 2, weight * blue[:, None], mask=valid)
+        store3(by_rgb, i, valid, weight * red[:, None], weight * green[:, None], weight * blue[:, None])
         behind += tl.sum(gained, 1)
 
 
@@ -155,14 +131,11 @@ def _distortion(
     STEPS: tl.constexpr,
 ):  # fmt: skip
     """Sum 2 sum_i w_i D_i + ..., with D_i = sum_(j<i) w_j (m_i - m_j) = D_(i-1) + (m_i - m_(i-1)) sum_(j<i) w_j."""
-    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
-    first, last = span_of(offsets, ray, rays)
-    longest = tl.max(last - first, 0).to(tl.int32)
+    ray, there, first, last, longest = own_rays(offsets, rays, RAYS)
     mass, apart = tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32)
     total = tl.zeros([RAYS], tl.float32)
     for step in range(0, longest, STEPS):
-        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
-        valid = i < last[:, None]
+        i, valid = samples_at(first, last, step, STEPS)
         later = valid & (i > first[:, None])
         ahead = tl.load(weights + i - 1, mask=later, other=0.0)
         gap = _gaps(starts, ends, i, later)
@@ -174,7 +147,7 @@ def _distortion(
         total += tl.sum(weight * (2.0 * distances + weight * length / 3.0), 1)
         mass += tl.sum(ahead, 1)
         apart += tl.sum(terms, 1)
-    tl.store(out + ray, total, mask=ray < rays)
+    tl.store(out + ray, total, mask=there)
 
 
 @jit
@@ -183,14 +156,12 @@ def _distortion_backward(
     RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
     """Write g (2 (D_i + D'_i) + ...), with D' like D but from the far end of the ray."""
-    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
-    first, last = span_of(offsets, ray, rays)
-    blocks = tl.cdiv(tl.max(last - first, 0).to(tl.int32), STEPS)
-    g = tl.load(gradient + ray, mask=ray < rays, other=0.0)[:, None] * 2.0
+    ray, there, first, last, longest = own_rays(offsets, rays, RAYS)
+    blocks = tl.cdiv(longest, STEPS)
+    g = tl.load(gradient + ray, mask=there, other=0.0)[:, None] * 2.0
     mass, apart = tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32)
     for block in range(blocks):
-        i = first[:, None] + (blocks - 1 - block) * STEPS + tl.arange(0, STEPS)[None, :]
-        valid = i < last[:, None]
+        i, valid = samples_at(first, last, (blocks - 1 - block) * STEPS, STEPS)
         further = valid & (i + 1 < last[:, None])
         behind = tl.load(weights + i + 1, mask=further, other=0.0)
         gap = _gaps(starts, ends, i + 1, further)

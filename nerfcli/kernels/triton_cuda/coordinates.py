@@ -6,7 +6,7 @@ from torch import Tensor
 
 from nerfcli.kernels.contraction import CONTRACTIONS
 from nerfcli.kernels.triton_cuda.launch import jit, launch
-from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, contracted_norm, span_of
+from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, load3, own_rays, raised_norm, samples_at, store3
 
 
 @jit
@@ -19,7 +19,7 @@ def _back_from_cube(x, y, z, a, b, c, CONTRACTION: tl.constexpr):
     if CONTRACTION == 0:
         return a * 0.5, b * 0.5, c * 0.5
     else:
-        norm = contracted_norm(x, y, z)
+        norm = raised_norm(x, y, z)
         inverse = 1.0 / norm
         scale = (2.0 - inverse) * inverse
         # In units of the norm, as squares of distant coordinates would overflow.
@@ -33,41 +33,24 @@ def _backward(
     origins, directions, starts, ends, offsets, gradient, by_origin,
     by_direction, rays, CONTRACTION: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
-    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
-    there = ray < rays
-    first, last = span_of(offsets, ray, rays)
-    longest = tl.max(last - first, 0).to(tl.int32)
-    ox = tl.load(origins + ray * 3, mask=there, other=0.0)[:, None]
-    oy = tl.load(origins + ray * 3 + 1, mask=there, other=0.0)[:, None]
-    oz = tl.load(origins + ray * 3 + 2, mask=there, other=0.0)[:, None]
-    dx = tl.load(directions + ray * 3, mask=there, other=0.0)[:, None]
-    dy = tl.load(directions + ray * 3 + 1, mask=there, other=0.0)[:, None]
-    dz = tl.load(directions + ray * 3 + 2, mask=there, other=0.0)[:, None]
+    ray, there, first, last, longest = own_rays(offsets, rays, RAYS)
+    ox, oy, oz = load3(origins, ray[:, None], there[:, None])
+    dx, dy, dz = load3(directions, ray[:, None], there[:, None])
     ax, ay, az = (tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32))
     bx, by, bz = (tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32))
     for step in range(0, longest, STEPS):
-        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
-        valid = i < last[:, None]
+        i, valid = samples_at(first, last, step, STEPS)
         t = (tl.load(starts + i, mask=valid, other=0.0) + tl.load(ends + i, mask=valid, other=0.0)) * 0.5
-        a, b, c = _back_from_cube(
-            ox + dx * t, oy + dy * t, oz + dz * t,
-            tl.load(gradient + i * 3, mask=valid, other=0.0),
-            tl.load(gradient + i * 3 + 1, mask=valid, other=0.0),
-            tl.load(gradient + i * 3 + 2, mask=valid, other=0.0),
-            CONTRACTION,
-        )  # fmt: skip
+        a, b, c = load3(gradient, i, valid)
+        a, b, c = _back_from_cube(ox + dx * t, oy + dy * t, oz + dz * t, a, b, c, CONTRACTION)
         ax += tl.sum(a, 1)
         ay += tl.sum(b, 1)
         az += tl.sum(c, 1)
         bx += tl.sum(a * t, 1)
         by += tl.sum(b * t, 1)
         bz += tl.sum(c * t, 1)
-    tl.store(by_origin + ray * 3, ax, mask=there)
-    tl.store(by_origin + ray * 3 + 1, ay, mask=there)
-    tl.store(by_origin + ray * 3 + 2, az, mask=there)
-    tl.store(by_direction + ray * 3, bx, mask=there)
-    tl.store(by_direction + ray * 3 + 1, by, mask=there)
-    tl.store(by_direction + ray * 3 + 2, bz, mask=there)
+    store3(by_origin, ray, there, ax, ay, az)
+    store3(by_direction, ray, there, bx, by, bz)
 
 
 def ray_gradients(

@@ -16,7 +16,7 @@ from nerfcli.kernels.reference.depth import SERIES_BELOW, VARIANCE_SERIES, VARIA
 from nerfcli.kernels.triton_cuda.compositing import absorbed
 from nerfcli.kernels.triton_cuda.hash_grid import device_floats
 from nerfcli.kernels.triton_cuda.launch import jit, launch
-from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, span_of
+from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, own_rays, samples_at
 
 THIN, VARIANCE_THIN = tl.constexpr(SERIES_BELOW), tl.constexpr(VARIANCE_SERIES_BELOW)
 # Six terms reach float32's precision at the limit.
@@ -51,16 +51,12 @@ def _ray_termination(
     mean, spread, at_peak, largest, quantiles, rays, FRACTIONS: tl.constexpr,
     RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
-    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
-    there = ray < rays
-    first, last = span_of(offsets, ray, rays)
-    longest = tl.max(last - first, 0).to(tl.int32)
+    ray, there, first, last, longest = own_rays(offsets, rays, RAYS)
     depth, total, mass = (tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32))
     most = tl.zeros([RAYS], tl.float32)
     where = tl.zeros([RAYS], tl.int64)
     for step in range(0, longest, STEPS):
-        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
-        valid = i < last[:, None]
+        i, valid = samples_at(first, last, step, STEPS)
         later = valid & (i > first[:, None])
         length = tl.load(ends + i, mask=valid, other=0.0) - tl.load(starts + i, mask=valid, other=0.0)
         own = tl.load(density + i, mask=valid, other=0.0) * length
@@ -84,8 +80,7 @@ def _ray_termination(
     mass = tl.where(ended, mass, 1.0)
     moment = tl.zeros([RAYS], tl.float32)
     for step in range(0, longest, STEPS):
-        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
-        valid = i < last[:, None]
+        i, valid = samples_at(first, last, step, STEPS)
         at = tl.load(starts + i, mask=valid, other=0.0)
         span = tl.load(ends + i, mask=valid, other=0.0) - at
         x = tl.load(density + i, mask=valid, other=0.0) * span
@@ -94,8 +89,7 @@ def _ray_termination(
     middle = moment / mass
     squares = tl.zeros([RAYS], tl.float32)
     for step in range(0, longest, STEPS):
-        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
-        valid = i < last[:, None]
+        i, valid = samples_at(first, last, step, STEPS)
         at = tl.load(starts + i, mask=valid, other=0.0)
         span = tl.load(ends + i, mask=valid, other=0.0) - at
         x = tl.load(density + i, mask=valid, other=0.0) * span
@@ -116,8 +110,7 @@ def _ray_termination(
         found = tl.zeros([RAYS], tl.int32) + NOWHERE
         crossing = tl.zeros([RAYS], tl.float32)
         for step in range(0, longest, STEPS):
-            i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
-            valid = i < last[:, None]
+            i, valid = samples_at(first, last, step, STEPS)
             later = valid & (i > first[:, None])
             at = tl.load(starts + i, mask=valid, other=0.0)
             span = tl.load(ends + i, mask=valid, other=0.0) - at

@@ -15,7 +15,18 @@ from nerfcli.kernels.contraction import CONTRACTIONS, sample_widths
 from nerfcli.kernels.interface import WIDTH, HashGrid, March, Rays, Samples
 from nerfcli.kernels.triton_cuda import hash_grid, networks
 from nerfcli.kernels.triton_cuda.launch import INTERPRETED, blocks, jit, launch
-from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, cube, fill_ray_indices, ray_indices, span_of
+from nerfcli.kernels.triton_cuda.rays import (
+    RAYS,
+    STEPS,
+    blocks_of,
+    cube,
+    fill_ray_indices,
+    load3,
+    own_rays,
+    ray_indices,
+    samples_at,
+    store3,
+)
 
 # Room for samples is a multiple of ROOM, about SPARE times the number needed last.
 ROOM, SPARE = 2**6 if INTERPRETED else 2**14, 1.25
@@ -41,12 +52,8 @@ def _march(
 ):  # fmt: skip
     ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
     there = ray < rays
-    ox = tl.load(origins + ray * 3, mask=there, other=0.0)[:, None]
-    oy = tl.load(origins + ray * 3 + 1, mask=there, other=0.0)[:, None]
-    oz = tl.load(origins + ray * 3 + 2, mask=there, other=0.0)[:, None]
-    dx = tl.load(directions + ray * 3, mask=there, other=0.0)[:, None]
-    dy = tl.load(directions + ray * 3 + 1, mask=there, other=0.0)[:, None]
-    dz = tl.load(directions + ray * 3 + 2, mask=there, other=0.0)[:, None]
+    ox, oy, oz = load3(origins, ray[:, None], there[:, None])
+    dx, dy, dz = load3(directions, ray[:, None], there[:, None])
     shift = tl.load(jitter + ray, mask=there, other=0.0)[:, None]
     scale = side.to(tl.float32)
     found = tl.zeros([RAYS], tl.int64)
@@ -73,9 +80,7 @@ def _march(
             fits = kept & (place < room)
             tl.store(starts + place, start, mask=fits)
             tl.store(ends + place, end, mask=fits)
-            tl.store(coordinates + place * 3, x, mask=fits)
-            tl.store(coordinates + place * 3 + 1, y, mask=fits)
-            tl.store(coordinates + place * 3 + 2, z, mask=fits)
+            store3(coordinates, place, fits, x, y, z)
         found += tl.sum(number, 1)
     if not WRITES:
         tl.store(counts + ray, found, mask=there)
@@ -91,18 +96,14 @@ def _visible(
     With WRITES, `counts` are the offsets of these samples, and their places are written to `sources`. With VISITS, the
     cells of `cell_depths` are raised to the optical depths of the samples in front of the limit.
     """
-    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
-    there = ray < rays
-    first, last = span_of(offsets, ray, rays)
+    ray, there, first, last, longest = own_rays(offsets, rays, RAYS)
     last = tl.minimum(last, room)
-    longest = tl.max(last - first, 0).to(tl.int32)
     depth = tl.zeros([RAYS], tl.float32)
     found = tl.zeros([RAYS], tl.int64)
     if WRITES:
         found = tl.load(counts + ray, mask=there, other=0)
     for step in range(0, longest, STEPS):
-        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
-        valid = i < last[:, None]
+        i, valid = samples_at(first, last, step, STEPS)
         # In front of each: a sum over the samples shifted by one place, so that nothing is subtracted from a sum.
         ahead = valid & (i > first[:, None])
         length = tl.load(ends + i - 1, mask=ahead, other=0.0) - tl.load(starts + i - 1, mask=ahead, other=0.0)
@@ -113,16 +114,13 @@ def _visible(
         reached = valid & (before < deepest)
         if VISITS:
             scale = side.to(tl.float32)
-            column = tl.minimum((tl.load(coordinates + i * 3, mask=reached, other=0.0) * scale).to(tl.int32), side - 1)
-            row = tl.minimum((tl.load(coordinates + i * 3 + 1, mask=reached, other=0.0) * scale).to(tl.int32), side - 1)
-            layer = tl.load(coordinates + i * 3 + 2, mask=reached, other=0.0) * scale
-            layer = tl.minimum(layer.to(tl.int32), side - 1)
+            x, y, z = load3(coordinates, i, reached)
+            column = tl.minimum((x * scale).to(tl.int32), side - 1)
+            row = tl.minimum((y * scale).to(tl.int32), side - 1)
+            layer = tl.minimum((z * scale).to(tl.int32), side - 1)
             # A NaN is left out; it differs from itself.
             tl.atomic_max(
-                cell_depths + (layer * side + row) * side + column,
-                own,
-                mask=reached & (own == own),
-                sem="relaxed",
+                cell_depths + (layer * side + row) * side + column, own, mask=reached & (own == own), sem="relaxed"
             )
         faint = own * tl.exp(-before) < least
         number = tl.where(reached & (faint == 0), 1, 0)
@@ -161,19 +159,11 @@ def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, 
 
 
 def visible_samples(
-    rays: Rays,
-    along: March,
-    grid: HashGrid,
-    *,
-    table: Tensor,
-    capacity: Capacity,
-    cell_depths: Tensor | None = None,
+    rays: Rays, along: March, grid: HashGrid, *, table: Tensor, capacity: Capacity, cell_depths: Tensor | None = None
 ) -> Samples:
-    """See `reference.visible_samples`; codes are float16.
+    """See `reference.visible_samples`; codes are float16, and so is `table`, that of the grid.
 
-    Args:
-        table: the grid's table in float16.
-        capacity: kept from call to call; if it is large enough, the host waits only once.
+    If the capacity, which is kept from call to call, is large enough, the host waits only once.
     """
     offsets = _counted(rays, along)
     count, least = len(rays.origins), along.least_weight

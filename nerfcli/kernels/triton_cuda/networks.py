@@ -14,6 +14,7 @@ from torch import Tensor
 from nerfcli.kernels.activations import LOG_DENSITY_LIMIT
 from nerfcli.kernels.interface import WIDTH
 from nerfcli.kernels.triton_cuda.launch import Size, blocks, jit, launch
+from nerfcli.kernels.triton_cuda.rays import load3
 
 
 @jit
@@ -112,9 +113,8 @@ def _bounded_exp(g, column):
 def _seen_along(directions, rays, i, valid, column, DEGREE: tl.constexpr):
     """Return the harmonics (BLOCK, 16), in float16, and the components (BLOCK, 1) of the directions of samples."""
     ray = tl.load(rays + i, mask=valid, other=0)
-    x = tl.load(directions + ray * 3, mask=valid, other=0.0)[:, None]
-    y = tl.load(directions + ray * 3 + 1, mask=valid, other=0.0)[:, None]
-    z = tl.load(directions + ray * 3 + 2, mask=valid, other=0.0)[:, None]
+    x, y, z = load3(directions, ray, valid)
+    x, y, z = x[:, None], y[:, None], z[:, None]
     return harmonics(x, y, z, column, DEGREE).to(tl.float16), x, y, z
 
 

@@ -6,25 +6,18 @@ from torch import Tensor
 
 from nerfcli.kernels.interface import PixelTable
 from nerfcli.kernels.triton_cuda.launch import blocks, jit, launch
-
-
-@jit
-def _bearing(bearings, at, valid):
-    x = tl.load(bearings + at * 3, mask=valid, other=0.0)
-    y = tl.load(bearings + at * 3 + 1, mask=valid, other=0.0)
-    z = tl.load(bearings + at * 3 + 2, mask=valid, other=0.0)
-    return x, y, z
+from nerfcli.kernels.triton_cuda.rays import load3
 
 
 @jit
 def _weighted(bearings, at, below, corners, valid):
     """Return the weighted sum of the bearings around a pixel, normalised; the first as it is if its weight is 1."""
-    first_x, first_y, first_z = _bearing(bearings, at, valid)
+    first_x, first_y, first_z = load3(bearings, at, valid)
     weight = tl.load(corners, mask=valid, other=1.0)
     alone = weight == 1.0
     x, y, z = weight * first_x, weight * first_y, weight * first_z
     for corner in tl.static_range(1, 4):
-        other_x, other_y, other_z = _bearing(bearings, at + corner % 2 + corner // 2 * below, valid & ~alone)
+        other_x, other_y, other_z = load3(bearings, at + corner % 2 + corner // 2 * below, valid & ~alone)
         factor = tl.load(corners + corner, mask=valid, other=0.0)
         x, y, z = x + factor * other_x, y + factor * other_y, z + factor * other_z
     norm = tl.sqrt(x * x + y * y + z * z)
@@ -55,7 +48,7 @@ def _pixels(
         at += place // width * below + place % width
         x, y, z = _weighted(bearings, at, below, corners + low * 4, valid)
     else:
-        x, y, z = _bearing(bearings, at + place, valid)
+        x, y, z = load3(bearings, at + place, valid)
     for axis in tl.static_range(3):
         row = poses + low * 16 + axis * 4
         along = tl.load(row, mask=valid, other=0.0) * x + tl.load(row + 1, mask=valid, other=0.0) * y

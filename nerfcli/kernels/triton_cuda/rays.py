@@ -20,7 +20,7 @@ def blocks_of(rays: int) -> tuple[int]:
 
 
 @jit
-def contracted_norm(x, y, z):
+def raised_norm(x, y, z):
     """Return the norm of a point, raised to at least 1."""
     largest = tl.maximum(tl.maximum(tl.abs(x), tl.abs(y)), tl.abs(z))
     shrink = tl.where(largest > FAR, SHRINK, 1.0)
@@ -34,28 +34,52 @@ def cube(x, y, z, CONTRACTION: tl.constexpr):
     if CONTRACTION == 0:
         return x * 0.5 + 0.5, y * 0.5 + 0.5, z * 0.5 + 0.5
     else:
-        norm = contracted_norm(x, y, z)
+        norm = raised_norm(x, y, z)
         scale = (2.0 - 1.0 / norm) * 0.25
         return x / norm * scale + 0.5, y / norm * scale + 0.5, z / norm * scale + 0.5
 
 
 @jit
-def span_of(offsets, ray, rays):
-    """Return the first samples of rays (RAYS,) and the ends of their samples, excluded; both 0 beyond the last ray."""
+def own_rays(offsets, rays, RAYS: tl.constexpr):
+    """Return the rays (RAYS,) of this program, which of them exist, their first samples, the ends of their samples,
+    excluded, and the most samples of a ray; the last three are 0 beyond the last ray."""
+    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
     there = ray < rays
     first = tl.load(offsets + ray, mask=there, other=0)
-    return first, tl.load(offsets + ray + 1, mask=there, other=0)
+    last = tl.load(offsets + ray + 1, mask=there, other=0)
+    return ray, there, first, last, tl.max(last - first, 0).to(tl.int32)
+
+
+@jit
+def samples_at(first, last, step, STEPS: tl.constexpr):
+    """Return the samples (RAYS, STEPS) of rays from number `step` of each on, and which of them exist."""
+    i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
+    return i, i < last[:, None]
+
+
+@jit
+def load3(values, i, valid):
+    """Return the three numbers of rows of `values`; 0 where they are not valid."""
+    x = tl.load(values + i * 3, mask=valid, other=0.0)
+    y = tl.load(values + i * 3 + 1, mask=valid, other=0.0)
+    return x, y, tl.load(values + i * 3 + 2, mask=valid, other=0.0)
+
+
+@jit
+def store3(values, i, valid, x, y, z):
+    """Write the three numbers of rows of `values`."""
+    tl.store(values + i * 3, x, mask=valid)
+    tl.store(values + i * 3 + 1, y, mask=valid)
+    tl.store(values + i * 3 + 2, z, mask=valid)
 
 
 @jit
 def _ray_indices(offsets, out, rays, RAYS: tl.constexpr, STEPS: tl.constexpr):
-    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
-    first, last = span_of(offsets, ray, rays)
-    longest = tl.max(last - first, 0).to(tl.int32)
+    ray, _, first, last, longest = own_rays(offsets, rays, RAYS)
     for step in range(0, longest, STEPS):
-        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
+        i, valid = samples_at(first, last, step, STEPS)
         owner = tl.zeros([RAYS, STEPS], tl.int64) + ray[:, None]
-        tl.store(out + i, owner, mask=i < last[:, None])
+        tl.store(out + i, owner, mask=valid)
 
 
 def fill_ray_indices(offsets: Tensor, out: Tensor) -> None:
@@ -73,15 +97,13 @@ def ray_indices(offsets: Tensor, samples: int | None = None) -> Tensor:
 
 @jit
 def _sum_rows(values, offsets, out, rays, COLUMNS: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr):
-    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
-    first, last = span_of(offsets, ray, rays)
-    longest = tl.max(last - first, 0).to(tl.int32)
+    ray, there, first, last, longest = own_rays(offsets, rays, RAYS)
     for column in tl.static_range(COLUMNS):
         total = tl.zeros([RAYS], tl.float32)
         for step in range(0, longest, STEPS):
-            i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
-            total += tl.sum(tl.load(values + i * COLUMNS + column, mask=i < last[:, None], other=0.0), 1)
-        tl.store(out + ray * COLUMNS + column, total, mask=ray < rays)
+            i, valid = samples_at(first, last, step, STEPS)
+            total += tl.sum(tl.load(values + i * COLUMNS + column, mask=valid, other=0.0), 1)
+        tl.store(out + ray * COLUMNS + column, total, mask=there)
 
 
 def sum_along_rays(values: Tensor, offsets: Tensor) -> Tensor:
