@@ -30,7 +30,7 @@ from nerfcli.export.fusion import fuse
 from nerfcli.export.meshes import Mesh, mesh_of, simplified, surface_of, without_small_pieces
 from nerfcli.kernels import grid_coordinates
 from nerfcli.render.depth import DepthRequest
-from nerfcli.render.files.float_maps import read_any_tiff
+from nerfcli.render.files.float_maps import read_tiff
 from nerfcli.render.model import Model
 from nerfcli.training.runs.run import load_run
 
@@ -46,7 +46,7 @@ def desk_views() -> tuple[Camera, list[tuple[np.ndarray, np.ndarray]]]:
     recorded = json.loads((DESK / "cameras.json").read_text(encoding="utf-8"))
     depths = {image["name"]: DESK / "depth" / f"{Path(image['name']).stem}.tiff" for image in recorded["images"]}
     images = [image for image in recorded["images"] if depths[image["name"]].exists()]
-    views = [(np.array(image["world_from_cam"]), read_any_tiff(depths[image["name"]])[0]) for image in images]
+    views = [(np.array(image["world_from_cam"]), read_tiff(depths[image["name"]])) for image in images]
     return Camera.from_json(recorded["camera"]), views
 
 

@@ -21,6 +21,7 @@ import pytest
 import typer.main
 from commands import completed, error_of, estimated_poses, listing, nerfcli, refusal, started
 from PIL import Image
+from present import present
 from typer.exceptions import TyperException
 
 from nerfcli import cli
@@ -44,6 +45,7 @@ from nerfcli.photos.masks import write_masks
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.render.depth import DepthRequest
+from nerfcli.render.files.file_facts import depth_meta_of
 from nerfcli.render.files.float_maps import read_tiff
 from nerfcli.training import loop
 from nerfcli.training.loop import Progress
@@ -376,8 +378,9 @@ def test_train_evaluate_render_info_in_a_row(capture):
     assert rendered.stderr == ""
     folder = run / "renders" / "test-median-ray"
     assert rendered.stdout.splitlines() == [str(folder / name) for name in ("rgb", "depth", "opacity")]
-    depth, meta = read_tiff(folder / "depth" / "test" / "r_000.tiff")
-    assert depth.shape == (9, 12)
+    path = folder / "depth" / "test" / "r_000.tiff"
+    meta = present(depth_meta_of(path))
+    assert read_tiff(path).shape == (9, 12)
     assert (meta.convention, meta.axis, meta.unit) == ("median", "ray", "arbitrary")
     reported = nerfcli("report", run, "--quiet")
     assert (reported.exit_code, reported.stdout) == (0, f"{run / 'report.html'}\n")

@@ -12,6 +12,7 @@ import pytest
 import tifffile
 from fog import fog, foggy_cells
 from PIL import Image
+from present import present
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -72,18 +73,16 @@ def listing(folder: Path) -> list[str]:
 def test_files_hold_what_was_rendered(model, tmp_path):
     written = export(model, [frame("a.png")], tmp_path / "views", formats=("tiff", "npy"))
     assert written == [tmp_path / "views" / name for name in ("rgb", "depth", "opacity")]
-    assert listing(tmp_path / "views") == [
-        *("depth/a.json", "depth/a.npy", "depth/a.png", "depth/a.tiff"),
-        *("opacity/a.png", "render.json", "rgb/a.png"),
-    ]
-    picture = render_picture(model, frame("a.png"), background=model.background, depth=DEPTH)
-    assert picture.depth is not None
-    depth, meta = read_tiff(tmp_path / "views/depth/a.tiff")
-    np.testing.assert_array_equal(depth, picture.depth)
-    np.testing.assert_array_equal(np.load(tmp_path / "views/depth/a.npy"), picture.depth)
+    files = ["depth/a.json", "depth/a.npy", "depth/a.png", "depth/a.tiff", "opacity/a.png", "render.json", "rgb/a.png"]
+    assert listing(tmp_path / "views") == files
+    picture = pictured(model)
+    path = tmp_path / "views/depth/a.tiff"
+    for depth in (read_tiff(path), np.load(path.with_suffix(".npy"))):
+        np.testing.assert_array_equal(depth, present(picture.depth))
     np.testing.assert_array_equal(read_image(tmp_path / "views/rgb/a.png"), np.round(picture.rgb * 255))
     grey = np.round(picture.opacity * 255)[..., None]
     np.testing.assert_array_equal(read_image(tmp_path / "views/opacity/a.png"), np.repeat(grey, 3, axis=-1))
+    meta = present(depth_meta_of(path))
     assert (meta.convention, meta.axis, meta.unit, meta.opacity_floor) == ("conditional", "z", "metre", 0.1)
     assert json.loads((tmp_path / "views/depth/a.json").read_text())["convention"] == "conditional"
 
@@ -112,22 +111,15 @@ def test_only_requested_outputs_are_written(model, tmp_path):
     assert "depth_meaning" not in json.loads((tmp_path / "views/render.json").read_text())
 
 
-@pytest.mark.parametrize(
-    ("convention", "floor"),
-    [
-        ("conditional", 0.1),
-        ("max-weight", 0.1),
-        ("moment", 0.0),
-        ("background", 0.0),
-        ("median", 0.5),
-        ("quantile:0.05", 0.1),
-    ],
-)
+FLOORS = {"conditional": 0.1, "max-weight": 0.1, "quantile:0.05": 0.1, "median": 0.5, "moment": 0.0, "background": 0.0}
+
+
+@pytest.mark.parametrize(("convention", "floor"), FLOORS.items())
 def test_each_convention_states_its_own_floor_and_background(convention, floor, model, tmp_path):
     request = DepthRequest(convention, "ray", min_opacity=0.1, background_distance=9.0)
     assert effective_floor(request) == floor
     export(model, [frame("a")], tmp_path / "views", outputs=("depth",), depth=request)
-    _, meta = read_tiff(tmp_path / "views/depth/a.tiff")
+    meta = present(depth_meta_of(tmp_path / "views/depth/a.tiff"))
     assert (meta.convention, meta.axis, meta.opacity_floor) == (convention, "ray", floor)
     assert meta.background_distance == (9.0 if convention == "background" else None)
 
@@ -160,12 +152,12 @@ def test_frames_in_subfolders_with_equal_names(model, tmp_path):
 def test_previews_share_one_range_over_all_frames(model, tmp_path):
     frames = [frame("near", 1.0), frame("far", 3.0)]
     export(model, frames, tmp_path / "views", outputs=("depth",))
-    depths = [read_tiff(tmp_path / f"views/depth/{name}.tiff") for name in ("near", "far")]
-    colours = value_range(lambda: iter([depth for depth, _ in depths]), "depth")
+    paths = [tmp_path / f"views/depth/{name}.tiff" for name in ("near", "far")]
+    colours = value_range(lambda: map(read_tiff, paths), "depth")
     assert colours.high - colours.low > 1.5
-    for name, (depth, meta) in zip(("near", "far"), depths, strict=True):
-        expected = preview(depth, meta, colours)
-        np.testing.assert_array_equal(read_image(tmp_path / f"views/depth/{name}.png"), expected)
+    for path in paths:
+        expected = preview(read_tiff(path), present(depth_meta_of(path)), colours)
+        np.testing.assert_array_equal(read_image(path.with_suffix(".png")), expected)
 
 
 def test_one_video_per_output_with_every_frame_in_it(model, tmp_path):
@@ -203,7 +195,7 @@ def test_every_file_states_the_error_of_its_rendering(views):
     assert facts["pixels_measured"] == 80
     assert facts["quadrature_of_depth_p95"] > 0
     assert "not how close the field is to the scene" in description["error_meaning"]
-    _, meta = read_tiff(views / "depth/a.tiff")
+    meta = present(depth_meta_of(views / "depth/a.tiff"))
     assert {name: meta.error_bounds[name] for name in facts} == facts
     assert meta.error_bounds["meaning"] == description["error_meaning"]
     with Image.open(views / "rgb/a.png") as picture:
@@ -232,8 +224,7 @@ def test_every_format_holds_the_maps_of_the_picture(model, tmp_path):
 @pytest.mark.parametrize("file_format", ["tiff", "exr", "npy", "png16"])
 def test_every_file_says_what_it_is_and_who_saw_it(file_format, model, tmp_path):
     export(model, [frame("a.png")], tmp_path / "views", formats=(file_format,))
-    meta = depth_meta_of(map_path(tmp_path / "views", "depth", "a", file_format))
-    assert meta is not None
+    meta = present(depth_meta_of(map_path(tmp_path / "views", "depth", "a", file_format)))
     assert (meta.convention, meta.axis, meta.opacity_floor) == ("conditional", "z", 0.1)
     assert (meta.unit, meta.unit_source) == ("metre", "gps")
     assert Camera.from_json(meta.view["camera"]) == CAMERA
@@ -246,16 +237,12 @@ def test_every_file_says_what_it_is_and_who_saw_it(file_format, model, tmp_path)
 def test_maps_beside_depth_state_their_own_convention_and_floor(model, tmp_path):
     """The median exists only where half of the light ends; the spread wherever depth is valid."""
     export(model, [frame("a")], tmp_path / "views", outputs=OUTPUTS, formats=("tiff", "exr"))
-    for output, convention, floor in (
-        ("spread", "standard-deviation", 0.1),
-        ("disagreement", "median-conditional", 0.5),
-    ):
-        meta = depth_meta_of(tmp_path / "views" / output / "a.tiff")
-        assert meta is not None
+    stated = [("spread", "standard-deviation", 0.1), ("disagreement", "median-conditional", 0.5)]
+    for output, convention, floor in stated:
+        meta = present(depth_meta_of(tmp_path / "views" / output / "a.tiff"))
         assert (meta.quantity, meta.convention, meta.opacity_floor) == (output, convention, floor)
         assert floor_of(DEPTH, output) == floor
-    whole = depth_meta_of(tmp_path / "views/exr/a.exr")
-    assert whole is not None
+    whole = present(depth_meta_of(tmp_path / "views/exr/a.exr"))
     assert whole.layers["disagreement"] == {"convention": "median-conditional", "opacity_floor": 0.5}
 
 
@@ -264,8 +251,7 @@ def test_levels_of_a_clip_in_metres_are_millimetres(model, tmp_path):
     export(model, [frame("a"), frame("b", 3.0)], tmp_path / "views", notes=notes, formats=("png16",))
     assert "16-bit files: one level is 1 mm, 0 means no value" in notes
     for name, distance in (("a", 2.0), ("b", 3.0)):
-        depth = pictured(model, name, distance).depth
-        assert depth is not None
+        depth = present(pictured(model, name, distance).depth)
         levels = np.asarray(Image.open(tmp_path / "views/depth16" / f"{name}.png"))
         expected = np.where(np.isnan(depth), 0, np.rint(depth.astype(np.float64) * 1000))
         np.testing.assert_array_equal(levels, expected)
@@ -292,8 +278,7 @@ def test_a_few_far_pixels_do_not_make_levels_coarse(tmp_path):
         levels = np.asarray(Image.open(tmp_path / "depth16" / f"{name}.png"))
         near = np.where(np.isnan(depth) | (depth > 65.5), 0, depth.astype(np.float64) * 1000)
         np.testing.assert_array_equal(levels, np.rint(near))
-    stated = depth_meta_of(tmp_path / "depth16" / "a.png")
-    assert stated is not None
+    stated = present(depth_meta_of(tmp_path / "depth16" / "a.png"))
     assert stated.error_bounds["pixels_beyond_levels"] == 3
     # If all depths are within twice the range that most of them need, the levels hold all.
     depths[0, :3, 0] = 5.0
@@ -317,9 +302,8 @@ def test_a_file_of_another_meaning_is_not_read_into_a_clip(file_format, model, t
 
 
 def test_depth_without_a_meaning_is_not_read_into_a_clip(model, tmp_path):
-    tifffile.imwrite(tmp_path / "a.tiff", np.zeros((8, 10), np.float32))
     (tmp_path / "depth").mkdir()
-    (tmp_path / "a.tiff").rename(tmp_path / "depth/a.tiff")
+    tifffile.imwrite(tmp_path / "depth/a.tiff", np.zeros((8, 10), np.float32))
     with pytest.raises(UserError, match="it does not state what its values mean"):
         read_map(tmp_path, "a", depth_meta(model, DEPTH))
 

@@ -2,13 +2,14 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from commands import completed, error_of, nerfcli
 from PIL import Image
+from present import present
 
+from nerfcli.render.files.file_facts import depth_meta_of
 from nerfcli.render.files.float_maps import read_tiff
 from nerfcli.workflows.views import file_fps
 
@@ -52,8 +53,9 @@ def test_depth_of_all_directions_is_along_the_rays(finished):
     assert refused.exit_code == USAGE
     assert "half of their directions are behind the camera" in error_of(refused)[0]
     folder = rendered(finished, "--lens", "equirectangular", "--width", "32", outputs="depth")
-    depth, meta = read_tiff(min(folder.glob("*.tiff")))
-    assert (depth.shape, meta.axis) == ((16, 32), "ray")
+    path = min(folder.glob("*.tiff"))
+    depth = read_tiff(path)
+    assert (depth.shape, present(depth_meta_of(path)).axis) == ((16, 32), "ray")
     # The fog stands in front of the camera, in the middle; behind it, at the left and right edge, is nothing.
     assert np.isfinite(depth[8, 16])
     assert np.isnan(depth[8, [0, 1, -2, -1]]).all()
@@ -61,7 +63,7 @@ def test_depth_of_all_directions_is_along_the_rays(finished):
 
 def test_pixels_without_a_ray_are_invalid(finished):
     folder = rendered(finished, "--lens", "fisheye", "--fov", "360", "--width", "17", "--height", "17", outputs="depth")
-    depth, _ = read_tiff(min(folder.glob("*.tiff")))
+    depth = read_tiff(min(folder.glob("*.tiff")))
     assert np.isnan(depth[[0, 0, -1, -1], [0, -1, 0, -1]]).all()
     assert np.isfinite(depth[8, 8])
 
@@ -92,20 +94,11 @@ def test_values_that_say_nothing(options, finished):
     assert not (finished / "renders").exists()
 
 
-def transforms(**changes: Any) -> dict[str, Any]:
-    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
-    return {"w": 64, "h": 48, "fl_x": 50.0, "frames": [frame], **changes}
-
-
-def camera_path(**changes: Any) -> dict[str, Any]:
-    view = {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50}
-    return {"render_width": 64, "render_height": 48, "camera_path": [view], **changes}
-
-
 def test_the_frame_rate_of_a_camera_path_is_the_default(tmp_path):
-    path = tmp_path / "path.json"
-    path.write_text(json.dumps(camera_path(fps=12)))
+    path, view = tmp_path / "path.json", {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50}
+    path.write_text(json.dumps({"render_width": 64, "render_height": 48, "camera_path": [view], "fps": 12}))
     assert file_fps(str(path)) == 12
-    path.write_text(json.dumps(transforms()))
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+    path.write_text(json.dumps({"w": 64, "h": 48, "fl_x": 50.0, "frames": [frame]}))
     assert file_fps(str(path)) is None
     assert file_fps("orbit") is None

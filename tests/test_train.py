@@ -107,7 +107,7 @@ def test_photos_of_a_desk_are_learned_too(with_points, tmp_path):
     names = default_split(frame.name for frame in frames)
     points = []
     for frame in (frame for frame in frames if frame.name in names):
-        depth, _ = read_tiff(desk / "truth" / "depth" / f"{Path(frame.name).stem}.tiff")
+        depth = read_tiff(desk / "truth" / "depth" / f"{Path(frame.name).stem}.tiff")
         bearings, _ = camera.pixel_bearings()
         in_camera = (bearings / bearings[:, 2:] * depth.reshape(-1, 1))[::400]
         points.append(apply(frame.world_from_cam, in_camera))
@@ -127,7 +127,7 @@ def test_trained_depth_is_the_true_depth_of_the_balls(axis, truth, spheres, sphe
     # Truth: rays intersected with the balls and the box in closed form, by the script that made the capture.
     model = load_model(spheres_run / "field.safetensors", "cpu")
     for index, frame in enumerate(spheres.test_frames):
-        expected, _ = read_tiff(SPHERES / "truth" / f"r_{index:03d}_{truth}.tiff")
+        expected = read_tiff(SPHERES / "truth" / f"r_{index:03d}_{truth}.tiff")
         request = DepthRequest("median", axis)
         depth = render_picture(model, frame, background=model.background, depth=request).depth
         assert depth is not None
@@ -141,7 +141,7 @@ def test_occupancy_keeps_the_surfaces_and_little_else(spheres, spheres_run):
     # Points just inside of the surfaces that the held-out views see, by the true distances along their rays.
     model = load_model(spheres_run / "field.safetensors", "cpu")
     for index, frame in enumerate(spheres.test_frames):
-        distance, _ = read_tiff(SPHERES / "truth" / f"r_{index:03d}_distance.tiff")
+        distance = read_tiff(SPHERES / "truth" / f"r_{index:03d}_distance.tiff")
         hit = np.isfinite(distance).ravel()
         bearings, _ = frame.camera.pixel_bearings()
         surface = frame.centre + (0.02 + distance.reshape(-1, 1)[hit]) * (

@@ -89,7 +89,7 @@ def read_map(folder: Path, name: str, meaning: DepthMeta) -> np.ndarray:
             return read_exr(path)[CHANNELS[output]]
         case ".npy":
             return read_npy(path)
-    return read_tiff(path)[0]
+    return read_tiff(path)
 
 
 @dataclass(frozen=True)

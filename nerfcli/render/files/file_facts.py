@@ -22,7 +22,7 @@ from PIL import Image
 from nerfcli.errors import UserError
 from nerfcli.photos.video import ffmpeg_program
 from nerfcli.render.files.depth_meta import FORMAT, KEY, DepthMeta, entries_of_text
-from nerfcli.render.files.float_maps import CHANNELS, depth_of_levels, read_any_tiff, read_exr, read_npy
+from nerfcli.render.files.float_maps import CHANNELS, depth_of_levels, read_exr, read_npy, read_tiff
 
 VIDEO_SUFFIXES = (".mp4", ".webm", ".mkv", ".mov", ".gif")
 
@@ -193,7 +193,7 @@ def _read_maps(path: Path, meta: DepthMeta | None) -> dict[str, np.ndarray]:
     """Return the arrays of a TIFF, OpenEXR or NPY file by name."""
     suffix = path.suffix.lower()
     if suffix != ".exr":
-        values = read_npy(path) if suffix == ".npy" else read_any_tiff(path)[0]
+        values = read_npy(path) if suffix == ".npy" else read_tiff(path)
         return {meta.quantity if meta else "array": values}
     channels = read_exr(path)
     if meta is None:

@@ -7,7 +7,6 @@ written.
 
 import contextlib
 import io
-import json
 import math
 import os
 import sys
@@ -80,32 +79,11 @@ def write_tiff(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
         )
 
 
-def read_tiff(path: Path) -> tuple[np.ndarray, DepthMeta]:
-    """Read a file of `write_tiff`: the depth, float32 (height, width), and its definition.
-
-    Raises:
-        UserError: the file is missing, damaged, not a float32 map, or does not describe its convention.
-    """
-    depth, description = read_any_tiff(path)
-    if depth.dtype != np.float32 or depth.ndim != 2:
-        raise UserError(
-            f"{path} contains {depth.dtype} {depth.shape}, not a float32 depth map", "give a file that nerfcli wrote"
-        )
-    try:
-        return depth, DepthMeta.from_json(json.loads(description))
-    except ValueError as error:
-        raise UserError(
-            f"{path} does not state its definition of depth (ImageDescription: {description[:40]!r})",
-            "give a file that nerfcli wrote",
-        ) from error
-
-
-def read_any_tiff(path: Path) -> tuple[np.ndarray, str]:
-    """Read the first page of a TIFF and its ImageDescription, written by any program."""
+def read_tiff(path: Path) -> np.ndarray:
+    """Read the first page of a TIFF, written by any program."""
     try:
         with tifffile.TiffFile(path) as tiff:
-            page = tiff.pages[0].aspage()
-            return page.asarray(), page.description
+            return tiff.pages[0].aspage().asarray()
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror or error}", "give a depth TIFF") from error
     except Exception as error:  # tifffile passes on any exception of its decoders
