@@ -1,5 +1,7 @@
 """Volumes: line integrals, their transpose, total variation, and denoising by it. Letters as in `interface`."""
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 
@@ -28,11 +30,7 @@ def project(
     Source: Joseph 1982, An improved algorithm for reprojecting rays through pixel images, IEEE TMI 1(3).
     """
     total = volume.new_zeros(len(origins))
-    for axis in range(3):
-        chosen = (_dominant(directions) == axis).nonzero()[:, 0]
-        if len(chosen) == 0:
-            continue
-        index, weight = _taps(volume.shape, origins[chosen], directions[chosen], axis=axis, first=first, size=size)
+    for chosen, index, weight in _taps(volume.shape, (origins - origins.new_tensor(first)) / size, directions, size):
         integral = (volume.reshape(-1)[index] * weight.to(volume.dtype)).sum((1, 2))
         total = total.index_add(0, chosen, integral)
     return total
@@ -52,37 +50,33 @@ def back_project(
     Formula: sum over r of values[r] * d project(volume)[r] / d volume. Source: as for `project`.
     """
     total = values.new_zeros(shape[0] * shape[1] * shape[2])
-    for axis in range(3):
-        chosen = (_dominant(directions) == axis).nonzero()[:, 0]
-        if len(chosen) == 0:
-            continue
-        index, weight = _taps(shape, origins[chosen], directions[chosen], axis=axis, first=first, size=size)
+    for chosen, index, weight in _taps(shape, (origins - origins.new_tensor(first)) / size, directions, size):
         spread = values[chosen, None, None] * weight.to(values.dtype)
         total = total.index_add(0, index.reshape(-1), spread.reshape(-1))
     return total.reshape(shape)
 
 
-def _dominant(directions: Tensor) -> Tensor:
-    """Return the axis (R,) that each line is most aligned with; the first one in a tie."""
-    return directions.abs().argmax(1)
-
-
 def _taps(
-    shape: tuple[int, ...],
-    origins: Tensor,
-    directions: Tensor,
-    *,
-    axis: int,
-    first: tuple[float, float, float],
-    size: float,
+    shape: tuple[int, ...], places: Tensor, directions: Tensor, size: float
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Yield the lines (R,) that are most aligned with an axis, the first one in a tie, for each axis that has some, and
+    indices and weights (R, planes, 4) of the voxels that they cross; weight 0 outside. `places` are in voxels from the
+    centre of the first one."""
+    dominant = directions.abs().argmax(1)
+    for axis in range(3):
+        chosen = (dominant == axis).nonzero()[:, 0]
+        if len(chosen):
+            yield chosen, *_taps_along(axis, shape, places[chosen], directions[chosen], size)
+
+
+def _taps_along(
+    axis: int, shape: tuple[int, ...], start: Tensor, directions: Tensor, size: float
 ) -> tuple[Tensor, Tensor]:
-    """Return indices and weights (R, planes, 4) of the voxels that lines along one axis cross; weight 0 outside."""
     counts = {0: shape[2], 1: shape[1], 2: shape[0]}
     strides = {0: 1, 1: shape[2], 2: shape[1] * shape[2]}
     b, c = (other for other in range(3) if other != axis)
-    start = (origins - origins.new_tensor(first)) / size
     slope = directions / directions[:, axis : axis + 1]
-    plane = torch.arange(counts[axis], device=origins.device, dtype=origins.dtype)
+    plane = torch.arange(counts[axis], device=start.device, dtype=start.dtype)
     length = size * slope.norm(dim=1)
 
     index = (plane.long() * strides[axis])[None, :, None]
