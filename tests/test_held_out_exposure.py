@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import ExifTags, Image
+from PIL import Image
+from test_exposure_and_background import save_photo
+from trainings import FEW, fit
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import from_parts
 from nerfcli.captures.capture import Capture
 from nerfcli.photos.held_out_exposure import (
     PhotoExposures,
@@ -19,10 +22,8 @@ from nerfcli.photos.held_out_exposure import (
     gains_beyond_exif,
     log_gains_of,
 )
-from nerfcli.training.loop import train
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.run import Run
-from nerfcli.training.runs.settings import TrainSettings
 
 
 def drifting(places: np.ndarray) -> np.ndarray:
@@ -135,31 +136,30 @@ def test_two_photos_give_no_estimate_and_are_refused():
 
 def trained(scene: Capture, run: Path, *, exposure: str) -> PhotoExposures:
     """Return the exposures that a short training finds."""
-    settings = TrainSettings(
-        budget_seconds=None,
-        steps=150,
-        log2_rows=8,
-        first_samples_per_step=2**10,
-        samples_per_step=2**10,
-        components=Components(exposure=exposure),
-        threads=1,
-    )
-    train(scene, run, settings, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
+    settings = replace(FEW, steps=150, log2_rows=8, threads=1, components=Components(exposure=exposure))
+    fit(scene, run, replace(settings, first_samples_per_step=2**10, samples_per_step=2**10))
     return Run(run).cameras.exposures
+
+
+def in_a_row(folder: Path, levels: list[int], *, held_out: int, seconds: list[float] | None = None) -> Capture:
+    """Return a capture of grey photos with little noise, beside each other, some with an exposure time in EXIF."""
+    frames = []
+    for index, level in enumerate(levels):
+        path, speckle = folder / f"{index}.png", np.random.default_rng(index).integers(-3, 4, (12, 16, 1))
+        pixels = np.repeat(level + speckle, 3, axis=2).astype(np.uint8)
+        if seconds is None:
+            Image.fromarray(pixels).save(path)
+        else:
+            save_photo(path, pixels, seconds=seconds[index])
+        pose = from_parts(np.eye(3), np.array([0.1 * index, 0.0, -2.0]))
+        frames.append(Frame(path.name, Camera.pinhole(16, 12, 14.0), pose, path))
+    return Capture(tuple(frames), kind="colmap", root=folder, test_names=frozenset({f"{held_out}.png"}))
 
 
 def test_training_estimates_exposures_of_held_out_photos_without_opening_them(tmp_path: Path):
     """Grey photos become brighter one by one; the last but one is held out and nearly black. Its gains are nevertheless
     between those of its neighbours, which are brighter than the mean."""
-    camera, frames = Camera.pinhole(16, 12, 14.0), []
-    for index in range(9):
-        level = 10 if index == 7 else 60 + 12 * index
-        noise = np.random.default_rng(index).integers(-3, 4, (12, 16, 1))
-        Image.fromarray(np.repeat(level + noise, 3, axis=2).astype(np.uint8)).save(tmp_path / f"{index}.png")
-        pose = np.eye(4)
-        pose[:3, 3] = [0.1 * index, 0.0, -2.0]
-        frames.append(Frame(f"{index}.png", camera, pose, tmp_path / f"{index}.png"))
-    scene = Capture(tuple(frames), np.zeros((9, 3)), kind="colmap", root=tmp_path, test_names=frozenset({"7.png"}))
+    scene = in_a_row(tmp_path, [10 if index == 7 else 60 + 12 * index for index in range(9)], held_out=7)
     known = trained(scene, tmp_path / "run", exposure="learned")
     assert set(known.exposures) == {"7.png"}
     reported = log_gains_of(scene.test_frames, known)
@@ -174,26 +174,10 @@ def test_a_run_keeps_the_offset_to_exif_of_held_out_photos(tmp_path: Path, expos
 
     These photos of plain walls have no matched pixels: with exposure=matched, all are learned, too.
     """
-    camera, frames = Camera.pinhole(16, 12, 14.0), []
     drift, jumps = np.linspace(-0.5, 0.5, 13), np.array([1, -1, -1, 1, 1, -1, 1, 1, -1, -1, 1, -1, 1]) * 0.25
-    for index, light in enumerate(0.15 * np.exp(drift + jumps)):
-        level = round(255 * (1.055 * light ** (1 / 2.4) - 0.055)) if index != 9 else 10
-        noise = np.random.default_rng(index).integers(-3, 4, (12, 16, 1))
-        exif = Image.Exif()
-        exif[ExifTags.Base.Orientation] = 1  # Pillow writes no EXIF into a PNG if its main directory is empty
-        exif.get_ifd(ExifTags.IFD.Exif).update(
-            {
-                ExifTags.Base.ExposureTime: float(np.exp(jumps[index])) / 100,
-                ExifTags.Base.ISOSpeedRatings: 100,
-                ExifTags.Base.FNumber: 2.0,
-            }
-        )
-        path = tmp_path / f"{index}.png"
-        Image.fromarray(np.repeat(level + noise, 3, axis=2).astype(np.uint8)).save(path, exif=exif)
-        pose = np.eye(4)
-        pose[:3, 3] = [0.1 * index, 0.0, -2.0]
-        frames.append(Frame(path.name, camera, pose, path))
-    scene = Capture(tuple(frames), np.zeros((13, 3)), kind="colmap", root=tmp_path, test_names=frozenset({"9.png"}))
+    levels = np.rint(255 * (1.055 * (0.15 * np.exp(drift + jumps)) ** (1 / 2.4) - 0.055)).astype(int)
+    levels[9] = 10
+    scene = in_a_row(tmp_path, levels.tolist(), held_out=9, seconds=(np.exp(jumps) / 100).tolist())
     known = trained(scene, tmp_path / "run", exposure=exposure)
     assert gain_sources(scene.test_frames, known) == ["EXIF and training photos around"]
     assert set(known.beyond_exif) == {"9.png"}
@@ -204,9 +188,8 @@ def test_a_run_keeps_the_offset_to_exif_of_held_out_photos(tmp_path: Path, expos
 def test_exif_of_a_held_out_photo_takes_precedence_over_its_neighbours(monkeypatch):
     """EXIF has the exposure of one photo only; a model without a mean exposure does not use it."""
     frames = [Frame(name, Camera.pinhole(4, 4, 4.0), np.eye(4)) for name in ("a", "b", "c")]
-    monkeypatch.setattr(
-        "nerfcli.photos.held_out_exposure.log_exposures", lambda frames: np.array([1.5, np.nan, np.nan])[: len(frames)]
-    )
+    of_exif = np.array([1.5, np.nan, np.nan])
+    monkeypatch.setattr("nerfcli.photos.held_out_exposure.log_exposures", lambda frames: of_exif[: len(frames)])
     around = {"a": (9.0, 9.0, 9.0), "b": (0.1, 0.2, 0.3)}
     known = PhotoExposures(log_exposure=1.0, exposures=around)
     assert log_gains_of(frames, known).tolist() == [[0.5] * 3, [0.1, 0.2, 0.3], [0.0] * 3]

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from present import present
+from trainings import FEW, fit
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.rigid import Similarity
+from nerfcli.cameras.rigid import Similarity, from_parts
 from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats.colmap import write_colmap_binary
 from nerfcli.captures.formats.scene_folder import MODEL_FOLDER, save
@@ -26,8 +28,7 @@ from nerfcli.matching.correspondences import SharedFeatures, chosen_pairs
 from nerfcli.matching.tracks import Tracks, triangulate
 from nerfcli.photos.loading import load_photos
 from nerfcli.training.evidence import point_depths, tracks_of_model
-from nerfcli.training.fitting import Fitting
-from nerfcli.training.loop import train
+from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.losses import emerging_losses
 from nerfcli.training.pool import PixelPool, PointRays
 from nerfcli.training.preparation import prepare
@@ -38,15 +39,9 @@ from nerfcli.training.selection import Facts
 from nerfcli.training.step import NonFiniteError
 
 CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
+SAME = Similarity.identity()
 # Both cameras see them; the first point is off by half a pixel in the second camera.
 POINTS = np.array([[0.0, 0.0, 1.0], [0.3, 0.1, 2.0], [-0.2, -0.1, 4.0]])
-
-
-def camera_at(x: float) -> np.ndarray:
-    """Return the pose of a camera at (x, 0, -2) that looks along z."""
-    matrix = np.eye(4)
-    matrix[:3, 3] = (x, 0.0, -2.0)
-    return matrix
 
 
 @pytest.fixture
@@ -56,13 +51,12 @@ def capture(tmp_path: Path) -> Capture:
     frames, rows = [], []
     for index in range(2):
         name = f"{index}.png"
-        for folder, picture in (
-            ("images", levels[index]),
-            ("masks", np.repeat(np.array([[0, 255]], np.uint8), 6, 1).repeat(8, 0)),
-        ):
+        mask = np.repeat(np.array([[0, 255]], np.uint8), 6, 1).repeat(8, 0)
+        for folder, picture in (("images", levels[index]), ("masks", mask)):
             (tmp_path / folder).mkdir(exist_ok=True)
             Image.fromarray(picture).save(tmp_path / folder / name)
-        frames.append(Frame(name, CAMERA, camera_at(0.2 * index), tmp_path / "images" / name))
+        pose = from_parts(np.eye(3), np.array([0.2 * index, 0.0, -2.0]))  # it looks along z
+        frames.append(Frame(name, CAMERA, pose, tmp_path / "images" / name))
         pixels, _ = CAMERA.project(POINTS - frames[index].centre)
         rows += [(index, point, pixel) for point, pixel in enumerate(pixels)]
     rows.append((0, -1, np.array([1.0, 1.0])))  # a feature that no other photo has
@@ -76,7 +70,13 @@ def capture(tmp_path: Path) -> Capture:
     return load_scene(tmp_path)
 
 
-def pool_of(scene: Capture, masks: str = "ignore", *, similarity: Similarity) -> PixelPool:
+@pytest.fixture
+def inputs(capture: Capture, tmp_path: Path) -> TrainingInputs:
+    settings = TrainSettings(budget_seconds=None, steps=10, components=Components(points=0.1))
+    return prepare(capture, settings, run=tmp_path, notify=lambda text: None)
+
+
+def pool_of(scene: Capture, masks: str = "ignore", *, similarity: Similarity = SAME) -> PixelPool:
     photos = load_photos(scene.train_frames, factor=1, threads=1, masks=masks)
     return PixelPool(photos, similarity, torch.device("cpu"))
 
@@ -106,8 +106,7 @@ def test_points_are_found_at_their_pixels_with_their_distances_and_trust(capture
 
 
 def test_points_behind_a_mask_are_not_looked_at(capture):
-    one = Similarity(1.0, np.eye(3), np.zeros(3))
-    pool = pool_of(capture, "ignore", similarity=one)
+    pool = pool_of(capture)
     of_points = point_depths(tracks_in(capture), pool)
     columns = [pool.place(number)[1] for number in of_points.numbers.tolist()]
     assert len(columns) == 3
@@ -117,10 +116,9 @@ def test_points_behind_a_mask_are_not_looked_at(capture):
 def test_only_training_photos_place_points(capture):
     """With the first photo held out, a single training photo sees each point, which gives no distance."""
     held_out = replace(capture, test_names=frozenset({"0.png"}))
-    one = Similarity(1.0, np.eye(3), np.zeros(3))
     tracks = tracks_in(held_out)
     assert set(tracks.photos.tolist()) == {0}
-    assert len(point_depths(tracks, pool_of(held_out, "empty", similarity=one)).numbers) == 0
+    assert len(point_depths(tracks, pool_of(held_out, "empty")).numbers) == 0
 
 
 def test_a_model_without_sightings_gives_no_tracks(spheres):
@@ -166,8 +164,7 @@ def test_the_gradient_of_light_off_its_target_is_right():
 
 
 def test_an_eighth_as_many_known_pixels_are_drawn_as_others(capture):
-    one = Similarity(1.0, np.eye(3), np.zeros(3))
-    pool = pool_of(capture, "empty", similarity=one)
+    pool = pool_of(capture, "empty")
     of_points = point_depths(tracks_in(capture), pool)
     generator = torch.Generator().manual_seed(0)
     both = PointRays([of_points], pool).added_to(pool.draw(80, generator), generator)
@@ -187,8 +184,7 @@ def test_the_loss_of_distances_is_a_log_likelihood_with_a_bounded_slope():
             expected = mpmath.mpf("1.1") * mpmath.log(mpmath.mpf("1.1") / (mpmath.mpf("1.1") - mpmath.mpf(off)))
         assert loss == pytest.approx(float(expected), rel=1e-12)
     losses.sum().backward()
-    assert depth_loss.grad is not None
-    assert depth_loss.grad[[0, -1]].tolist() == pytest.approx([1.0, 11.0])
+    assert present(depth_loss.grad)[[0, -1]].tolist() == pytest.approx([1.0, 11.0])
     assert torch.autograd.gradcheck(emerging_losses, (depth_loss[1:4].detach().requires_grad_(),))
 
 
@@ -201,8 +197,7 @@ def test_a_known_surface_that_is_nearly_empty_gets_eleven_times_the_gradient():
         middles, distances = torch.tensor([0.5, 1.0, 1.5]).double(), torch.tensor([1.0]).double()
         off = reference.depth_loss(weights, transmittance, middles, offsets=offsets, distances=distances)
         loss(off).sum().backward()
-        assert log_density.grad is not None
-        gradients.append(log_density.grad[1].item())
+        gradients.append(present(log_density.grad)[1].item())
     assert gradients[1] / gradients[0] == pytest.approx(11.0, rel=1e-4)
 
 
@@ -238,9 +233,7 @@ def test_trials_that_become_non_finite_end_without_an_error(capture, tmp_path, m
     assert inputs.settings.components.points > 0.0
 
 
-def test_known_distances_are_a_log_likelihood_only_until_surfaces_have_emerged(capture, tmp_path, monkeypatch):
-    settings = TrainSettings(budget_seconds=None, steps=10, components=Components(points=0.1))
-    inputs = prepare(capture, settings, run=tmp_path, notify=lambda text: None)
+def test_known_distances_are_a_log_likelihood_only_until_surfaces_have_emerged(inputs, monkeypatch):
     fitting, emerging = Fitting(inputs), []
 
     def recorded(depth_loss: torch.Tensor) -> torch.Tensor:
@@ -261,19 +254,15 @@ def test_points_fade_out():
 
 
 @pytest.mark.parametrize(("parallax", "weight"), [(1.0, 0.5), (0.5, 0.125)])
-def test_points_of_a_narrow_baseline_fade_with_the_steps_of_a_training(
-    parallax: float, weight: float, capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_points_of_a_narrow_baseline_fade_with_the_steps_of_a_training(parallax, weight, inputs, monkeypatch):
     """Half of the budget and four times 800 steps: a loss of 4 for each distance adds 4 times its weight."""
-    settings = TrainSettings(budget_seconds=None, steps=10, components=Components(points=0.1))
-    inputs = prepare(capture, settings, run=tmp_path, notify=lambda text: None)
     losses = []
     for value in (0.0, 4.0):
         monkeypatch.setattr("nerfcli.training.schedule.EMERGING_ENDS", 1.0)
         monkeypatch.setattr("nerfcli.training.step.emerging_losses", lambda off, value=value: 0 * off + value)
         fitting = Fitting(inputs)
-        assert fitting.points is not None
-        trusted = [replace(points, trust=torch.ones_like(points.trust)) for points in fitting.points.sets]
+        sets = present(fitting.points).sets
+        trusted = [replace(points, trust=torch.ones_like(points.trust)) for points in sets]
         fitting.points = PointRays(trusted, inputs.pool)
         fitting.step, fitting.schedule = 3200, replace(fitting.schedule, parallax=parallax)
         losses.append(fitting.advance(0.5).loss)
@@ -281,8 +270,7 @@ def test_points_of_a_narrow_baseline_fade_with_the_steps_of_a_training(
 
 
 def test_black_of_a_mask_is_ignored_or_is_empty_space(capture):
-    one = Similarity(1.0, np.eye(3), np.zeros(3))
-    ignored, empty = (pool_of(capture, masks, similarity=one) for masks in ("ignore", "empty"))
+    ignored, empty = (pool_of(capture, masks) for masks in ("ignore", "empty"))
     assert (ignored.has_alpha, ignored.usable_count) == (False, 96)
     assert (empty.has_alpha, empty.usable_count) == (True, 192)
     alpha = empty.colours[:, 3].view(2, 8, 12)
@@ -294,18 +282,10 @@ def test_black_of_a_mask_is_ignored_or_is_empty_space(capture):
 def test_training_takes_all_of_them_at_once(capture, tmp_path):
     # Equal seeds give equal losses, which are finite with every prior on.
     components = Components(masks="empty", points=0.1)
-    settings = TrainSettings(
-        budget_seconds=None, steps=4, first_samples_per_step=2**9, samples_per_step=2**9, components=components
-    )
-    losses: list[list[float]] = []
-    for name in ("one", "two"):
-        losses.append([])
-        train(
-            capture, tmp_path / name, settings, resume=False, notify=lambda text: None,
-            on_progress=lambda progress: losses[-1].append(progress.loss),
-        )  # fmt: skip
-    assert losses[0] == losses[1]
-    assert all(map(math.isfinite, losses[0]))
+    settings = replace(FEW, steps=4, components=components)
+    one, other = ([step.loss for step in fit(capture, tmp_path / name, settings)] for name in ("one", "two"))
+    assert one == other
+    assert all(map(math.isfinite, one))
 
 
 def test_a_short_training_takes_known_points_without_a_trial(capture, tmp_path):
@@ -313,16 +293,14 @@ def test_a_short_training_takes_known_points_without_a_trial(capture, tmp_path):
     reported: list[str] = []
     inputs = prepare(capture, settings, run=tmp_path, notify=reported.append)
     assert inputs.settings.components == Components(points=0.1)
-    assert inputs.points is not None
-    assert [len(depths.numbers) for depths in inputs.points.sets] == [3]
+    assert [len(depths.numbers) for depths in present(inputs.points).sets] == [3]
     assert "points: kept, 3 pixels see a 3D point at a known distance" in reported
 
 
 @pytest.mark.parametrize("limit", [{"budget_seconds": None, "steps": 10}, {"budget_seconds": 1.0}])
 def test_a_short_training_does_not_wait_for_photos_to_be_compared(capture, tmp_path, monkeypatch, limit):
-    monkeypatch.setattr(
-        "nerfcli.matching.correspondences.match", lambda *photos, **threads: pytest.fail("photos were compared")
-    )
+    compared = "nerfcli.matching.correspondences.match"
+    monkeypatch.setattr(compared, lambda *photos, **threads: pytest.fail("photos were compared"))
     without_model = replace(capture, root=tmp_path / "elsewhere")
     settings = TrainSettings(**limit, model="auto")
     inputs = prepare(without_model, settings, run=tmp_path, notify=lambda text: None)
@@ -341,11 +319,9 @@ def test_lenses_that_are_to_learn_begin_where_matched_features_say(cameras, capt
     learns = cameras in ("focal", "all")
     assert inputs.log_focal == (check.log_focal if learns else 0.0)
     assert any("suggest a focal length 1.88 %" in line for line in reported) == learns
-    refined = Fitting(inputs).appearance.cameras
     if learns:
-        assert refined is not None
-        assert refined.lenses is not None
-        assert refined.lenses.values.min().item() == pytest.approx(check.log_focal)
+        refined = present(Fitting(inputs).appearance.cameras)
+        assert present(refined.lenses).values.min().item() == pytest.approx(check.log_focal)
 
 
 def test_comparing_photos_has_a_price_once(spheres):

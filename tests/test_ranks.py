@@ -18,6 +18,8 @@ import numpy as np
 import pytest
 import torch
 from commands import error_of, nerfcli
+from present import present
+from trainings import FEW
 
 from nerfcli import distributed, machine
 from nerfcli.errors import INTERRUPTED, LOST_RANK, TERMINATED
@@ -41,9 +43,7 @@ VARIANTS = {
     "points,occluders": (100, 24),
     "cameras=all": (100, 14),
 }
-SMALL = TrainSettings(
-    budget_seconds=None, steps=200, log2_rows=12, first_samples_per_step=2**11, samples_per_step=2**11, threads=1
-)
+SMALL = replace(FEW, steps=200, log2_rows=12, first_samples_per_step=2**11, samples_per_step=2**11, threads=1)
 TRAININGS = """
 import atexit, gc, math, sys
 from dataclasses import replace
@@ -80,8 +80,7 @@ def settings_with(components: str, steps: int) -> TrainSettings:
 
 def train_until(step: int, run: Path, settings: TrainSettings) -> None:
     """Train, and stop as Ctrl-C does."""
-    assert settings.steps is not None
-    stop = step / settings.steps
+    stop = step / present(settings.steps)
 
     def progress(fraction: float, detail: str) -> None:
         if fraction >= stop:
@@ -115,10 +114,8 @@ def two_ranks(program: str, *arguments: str | Path) -> list[subprocess.Popen[str
         found.bind(("127.0.0.1", 0))
         port = found.getsockname()[1]
     command = [sys.executable, "-c", program, *map(str, arguments)]
-    return [
-        subprocess.Popen(command, env=of_rank(rank, port), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        for rank in range(2)
-    ]
+    pipe = subprocess.PIPE
+    return [subprocess.Popen(command, env=of_rank(rank, port), stdout=pipe, stderr=pipe, text=True) for rank in (0, 1)]
 
 
 def ended(processes: Sequence[subprocess.Popen[str]]) -> list[tuple[int, str, list[str]]]:

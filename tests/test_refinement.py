@@ -9,7 +9,8 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 from lenses import HEIGHT, MODELS, WIDTH, random_camera
-from trainings import fit
+from present import present
+from trainings import FEW, fit, resumed_bit_for_bit
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.lens_change import bearings_by_change, changeable, changed
@@ -39,15 +40,11 @@ from nerfcli.training.schedule import CAMERAS_END, camera_plan
 from nerfcli.workflows.describe import camera_moves
 
 seeds = st.integers(0, 2**32 - 1)
-FEW = TrainSettings(
-    budget_seconds=None, steps=12, first_samples_per_step=2**9, samples_per_step=2**9, log2_rows=10, threads=2
-)
 
 
 def random_poses(rng: np.random.Generator, count: int) -> np.ndarray:
-    return np.array(
-        [look_at(rng.normal(size=3) * 3, rng.normal(size=3) * 0.2, np.array([0, 0, 1])) for _ in range(count)]
-    )
+    centres, targets = (size * rng.normal(size=(count, 3)) for size in (3.0, 0.2))
+    return np.array([look_at(*pair, np.array([0, 0, 1])) for pair in zip(centres, targets, strict=True)])
 
 
 def turned(scene: Capture, degrees: float) -> Capture:
@@ -78,27 +75,35 @@ def pool_of(scene: Capture) -> PixelPool:
     return PixelPool(photos, Similarity.identity(), torch.device("cpu"))
 
 
+@pytest.fixture
+def pool(small: Capture) -> PixelPool:
+    return pool_of(small)
+
+
 def linear_loss(pool: PixelPool, refinement: Refinement, numbers: torch.Tensor, slopes: torch.Tensor) -> float:
     """Return a loss that is linear in the rays, so that `slopes` are exactly its gradients by them."""
     drawn = refinement.refine_cameras(pool.rays_of(numbers))
     return float((torch.stack([drawn.origins, drawn.directions]).double() * slopes).sum())
 
 
-def test_pose_gradient_is_the_difference_of_a_loss(small):
-    """Central differences of a loss that is linear in the rays, from poses that have moved already."""
-    pool, generator = pool_of(small), torch.Generator().manual_seed(3)
+def rays_and_slopes(pool: PixelPool) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the numbers of 300 pixels, and gradients (2, 300, 3) by the origins and directions of their rays."""
+    generator = torch.Generator().manual_seed(3)
     numbers = pool.draw(300, generator).numbers
-    slopes = torch.randn(2, 300, 3, generator=generator, dtype=torch.float64)
+    return numbers, torch.randn(2, 300, 3, generator=generator, dtype=torch.float64)
+
+
+def test_pose_gradient_is_the_difference_of_a_loss(pool, generator):
+    """Central differences of a loss that is linear in the rays, from poses that have moved already."""
+    numbers, slopes = rays_and_slopes(pool)
     refinement = Refinement("poses", pool)
-    poses = refinement.poses
-    assert poses is not None
+    poses = present(refinement.poses)
     twists = 0.1 * torch.randn(3, 6, generator=generator, dtype=torch.float64)
     start = torch.from_numpy(transform_from_twist(twists.numpy()))
     poses.motions.copy_(start)
     drawn = refinement.refine_cameras(pool.rays_of(numbers))
-    of_rays = poses.gradients(
-        drawn.directions.double(), pool.photo_of(numbers), by_origin=slopes[0], by_direction=slopes[1]
-    )
+    by_rays = {"by_origin": slopes[0], "by_direction": slopes[1]}
+    of_rays = poses.gradients(drawn.directions.double(), pool.photo_of(numbers), **by_rays)
     found = torch.zeros(3, 6, dtype=torch.float64).index_add_(0, pool.photo_of(numbers), of_rays)
     step = 1e-2  # float32 rays; the third derivative of a turn is about the first
     for photo in range(3):
@@ -123,13 +128,10 @@ def with_lens(small: Capture, shifts: tuple[float, ...]) -> Capture:
 
 @pytest.mark.parametrize("shifts", [(0.0, 0.0, 0.0, 0.0), (0.0, 3.2, -1.7, 2.0)])
 def test_lens_gradient_is_the_difference_of_a_loss(small, shifts):
-    scene = with_lens(small, shifts)
-    pool, generator = pool_of(scene), torch.Generator().manual_seed(3)
-    numbers = pool.draw(300, generator).numbers
-    slopes = torch.randn(2, 300, 3, generator=generator, dtype=torch.float64)
+    pool = pool_of(with_lens(small, shifts))
+    numbers, slopes = rays_and_slopes(pool)
     refinement = Refinement("all", pool)
-    lenses = refinement.lenses
-    assert lenses is not None
+    lenses = present(refinement.lenses)
     start = torch.tensor([[0.02, 0.01, -0.01]], dtype=torch.float64)
     lenses.values.copy_(start)
     turns = pool.poses[:, :3, :3].double()
@@ -148,8 +150,7 @@ def test_photos_of_a_stabilised_lens_change_together(small):
     """Whatever a lens learns holds for all its photos, the held-out one too; principal points stay where they are."""
     scene = with_lens(small, (0.0, 3.2, -1.7, 2.0))
     refinement = Refinement("all", pool_of(scene))
-    assert refinement.lenses is not None
-    refinement.lenses.values.copy_(torch.tensor([[0.02, 0.01, -0.01]], dtype=torch.float64))
+    present(refinement.lenses).values.copy_(torch.tensor([[0.02, 0.01, -0.01]], dtype=torch.float64))
     training, held_out = refinement.frames(scene.train_frames, scene.test_frames)
     before = {frame.name: frame.camera for frame in scene.frames}
     for frame in (*training, *held_out):
@@ -192,9 +193,8 @@ def test_taking_out_the_mean_leaves_cameras_as_they_stand_to_each_other(seed):
     before = random_poses(rng, 5)
     after = before @ transform_from_twist(rng.normal(size=(5, 6)) * 0.05)
     kept = without_mean(before, after)
-    np.testing.assert_allclose(
-        inverse(kept[0])[:3, :3] @ kept[1:, :3, :3], inverse(after[0])[:3, :3] @ after[1:, :3, :3], atol=1e-12
-    )
+    found, expected = (inverse(poses[0])[:3, :3] @ poses[1:, :3, :3] for poses in (kept, after))
+    np.testing.assert_allclose(found, expected, atol=1e-12)
     apart = [np.linalg.norm(poses[1:, :3, 3] - poses[0, :3, 3], axis=1) for poses in (kept, after)]
     np.testing.assert_allclose(apart[0] / apart[1], (apart[0] / apart[1])[0], rtol=1e-12)
 
@@ -226,11 +226,9 @@ def test_a_turn_of_each_camera_on_its_spot_counts_as_the_move_that_it_would_be(r
     np.testing.assert_allclose(vector_from_rotation(found.rotation), 0.6 * turn, rtol=1e-6)
 
 
-def test_a_step_of_poses_leaves_no_mean_and_far_cameras_see_moves_less(small):
+def test_a_step_of_poses_leaves_no_mean_and_far_cameras_see_moves_less(pool, generator):
     """A step leaves no mean motion; the effect of a move on the picture is inverse to the distance."""
-    pool, generator = pool_of(small), torch.Generator().manual_seed(0)
-    poses = Refinement("poses", pool).poses
-    assert poses is not None
+    poses = present(Refinement("poses", pool).poses)
     given = poses.poses()
     gradients = torch.randn(90, 6, generator=generator, dtype=torch.float64) + 1.0
     poses.step(gradients, torch.full((90,), 0.5, dtype=torch.float64), torch.arange(90) % 3, camera_plan(0.3), rate=1.0)
@@ -253,9 +251,8 @@ def test_how_the_picture_moves_with_a_pose(small):
     points = np.concatenate([3 * fraction * bearings for fraction in (2 / 3, 1.0, 2.0)])
     columns = []
     for twist in np.eye(6):
-        ahead, behind = (
-            camera.project(apply(inverse(transform_from_twist(sign * step * twist)), points))[0] for sign in (1, -1)
-        )
+        moved = [apply(inverse(transform_from_twist(sign * step * twist)), points) for sign in (1, -1)]
+        ahead, behind = (camera.project(places)[0] for places in moved)
         columns.append((ahead - behind).ravel() / (2 * step * camera.focal_px * np.sqrt(len(points))))
     jacobian = np.stack(columns, axis=-1)
     refinement = PoseRefinement(pose[None], [camera])
@@ -365,11 +362,7 @@ def test_a_step_is_the_one_that_the_formula_says(damping, holding, scale):
 
 
 # One ray without a slope or a loss, of the first photo.
-NO_RAYS = (
-    torch.zeros(1, 6, dtype=torch.float64),
-    torch.zeros(1, dtype=torch.float64),
-    torch.zeros(1, dtype=torch.long),
-)
+NO_RAYS = torch.zeros(1, 6).double(), torch.zeros(1).double(), torch.zeros(1).long()
 
 
 def steps_of(monkeypatch: pytest.MonkeyPatch, twist: float) -> list[dict[str, float]]:
@@ -403,8 +396,8 @@ def test_poses_that_float32_has_rounded_stay_rigid(small, monkeypatch):
     """A rotation in float32 is orthonormal to 6e-8, which 100 steps without motion would raise to 1e-5."""
     steps_of(monkeypatch, 0.0)
     frames = small.train_frames
-    poses = Refinement("poses", pool_of(replace(small, frames=(*frames, frames[0]), test_names=frozenset()))).poses
-    assert poses is not None
+    pool = pool_of(replace(small, frames=(*frames, frames[0]), test_names=frozenset()))
+    poses = present(Refinement("poses", pool).poses)
     for _ in range(100):
         poses.step(*NO_RAYS, camera_plan(0.5), rate=1.0)
     rotations = poses.poses()[:, :3, :3]
@@ -423,16 +416,13 @@ def test_poses_go_by_the_rate_of_the_whole_way(monkeypatch):
     np.testing.assert_allclose(ways[1], 0.1 * ways[0], atol=1e-13)
 
 
-def test_a_step_of_all_hands_each_part_what_it_needs(small, monkeypatch):
+def test_a_step_of_all_hands_each_part_what_it_needs(pool, monkeypatch):
     """Poses: the gradient of every ray's own loss, not of their mean. Lenses: the turns of the poses as they are now,
     and their own rate."""
-    pool = pool_of(small)
     refinement = Refinement("all", pool)
-    assert refinement.poses is not None
-    lenses = refinement.lenses
-    assert lenses is not None
+    poses, lenses = present(refinement.poses), present(refinement.lenses)
     turns = np.stack([transform_from_twist(np.array([0, 0, 0, 0.1 * i, 0, 0])) for i in range(1, 4)])
-    refinement.poses.motions.copy_(torch.from_numpy(turns))
+    poses.motions.copy_(torch.from_numpy(turns))
     given: dict[str, torch.Tensor | float] = {}
 
     def lens_gradient(numbers: torch.Tensor, photos: torch.Tensor, **rays: torch.Tensor) -> torch.Tensor:
@@ -441,18 +431,15 @@ def test_a_step_of_all_hands_each_part_what_it_needs(small, monkeypatch):
 
     monkeypatch.setattr(lenses, "gradient", lens_gradient)
     monkeypatch.setattr(lenses, "step", lambda gradient, rate: given.update(lens_rate=rate))
-    monkeypatch.setattr(refinement.poses, "gradients", lambda *rays, **slopes: slopes["by_origin"].repeat(1, 2))
-    monkeypatch.setattr(
-        refinement.poses, "step", lambda slopes, losses, photos, plan, *, rate: given.update(slopes=slopes, rate=rate)
-    )
+    monkeypatch.setattr(poses, "gradients", lambda *rays, **slopes: slopes["by_origin"].repeat(1, 2))
+    monkeypatch.setattr(poses, "step", lambda slopes, *others, rate: given.update(slopes=slopes, rate=rate))
     numbers = torch.arange(50)
     drawn = refinement.refine_cameras(pool.rays_of(numbers))
     drawn = drawn._replace(origins=drawn.origins.requires_grad_(), directions=drawn.directions.requires_grad_())
     losses = (drawn.origins + drawn.directions).square().sum(-1)
     losses.mean().backward()
     refinement.step(drawn, losses.detach(), camera_plan(0.3), factor=0.5)
-    rays_now = refinement.poses.poses()[:, :3, :3]
-    np.testing.assert_allclose(given["turns"], rays_now)
+    np.testing.assert_allclose(given["turns"], poses.poses()[:, :3, :3])
     assert (given["rate"], given["lens_rate"]) == (0.5, pytest.approx(0.5 * LENS_RATE))
     own = 2.0 * (drawn.origins + drawn.directions).detach().double()
     torch.testing.assert_close(given["slopes"], own.repeat(1, 2), rtol=1e-5, atol=1e-6)
@@ -468,8 +455,7 @@ def test_rates_rise_from_nothing_and_end_at_nothing():
 
 
 @pytest.mark.parametrize("refined", ["poses", "focal"])
-def test_cameras_that_have_not_changed_give_the_same_rays(refined, small):
-    pool = pool_of(small)
+def test_cameras_that_have_not_changed_give_the_same_rays(refined, pool):
     drawn = pool.draw(100, torch.Generator().manual_seed(0))
     again = Refinement(refined, pool).refine_cameras(drawn)
     assert torch.equal(again.origins, drawn.origins)
@@ -482,11 +468,9 @@ def test_moves_are_reported_in_degrees_and_percent(small):
     turn = transform_from_twist(np.array([0, 0, 0, 0, 0, np.radians(2.0)]))
     move = transform_from_twist(np.array([0, 0.3, 0, 0, 0, 0]))
     longer = changed(first.camera, ("focal",), np.log([1.01]))
-    after = [
-        replace(first, world_from_cam=first.world_from_cam @ turn, camera=longer),
-        replace(second, world_from_cam=second.world_from_cam @ move, camera=longer),
-        third,
-    ]
+    first_after = replace(first, world_from_cam=first.world_from_cam @ turn, camera=longer)
+    second_after = replace(second, world_from_cam=second.world_from_cam @ move, camera=longer)
+    after = [first_after, second_after, third]
     moves = camera_moves([first, second, third], after, radius=6.0)
     assert moves["rotation_deg"] == {"median": 0.0, "max": 2.0}
     assert moves["translation_percent"] == {"median": 0.0, "max": 5.0}
@@ -498,12 +482,12 @@ def test_frames_are_where_the_cameras_of_the_training_frame_are(small):
     similarity = Similarity(2.5, rotation_from_vector(np.array([0.3, -0.2, 0.9])), np.array([1.0, 2.0, 3.0]))
     pool = PixelPool(load_photos(small.train_frames, factor=1, threads=1), similarity, torch.device("cpu"))
     refinement = Refinement("poses", pool)
-    assert refinement.poses is not None
+    poses = present(refinement.poses)
     twists = np.random.default_rng(0).normal(size=(3, 6)) * 0.1
-    refinement.poses.motions.copy_(torch.from_numpy(transform_from_twist(twists)))
+    poses.motions.copy_(torch.from_numpy(transform_from_twist(twists)))
     refined, held_out = refinement.frames(small.train_frames, small.test_frames)
-    poses = similarity.apply_pose(np.array([frame.world_from_cam for frame in refined]))
-    np.testing.assert_allclose(poses, refinement.poses.poses(), atol=1e-5)  # those of the pool are float32
+    exported = similarity.apply_pose(np.array([frame.world_from_cam for frame in refined]))
+    np.testing.assert_allclose(exported, poses.poses(), atol=1e-5)  # those of the pool are float32
     assert np.array_equal(held_out[0].world_from_cam, small.test_frames[0].world_from_cam)
 
 
@@ -520,17 +504,14 @@ def test_displaced_cameras_return_to_their_places_in_a_trained_field(spheres, sp
         components=Components(cameras="poses"), learning_rate=1e-30, final_learning_rate=1e-30,
     )  # fmt: skip
     fitting = Fitting(TrainingInputs(settings, extent, pool))
-    cameras = fitting.appearance.cameras
-    assert cameras is not None
+    cameras = present(fitting.appearance.cameras)
     tensors |= {f"parts.{name}": value.clone() for name, value in fitting.appearance.state_dict().items()}
     fitting.restore(tensors, description)
     truth = extent.training_from_scene.apply_pose(np.array([f.world_from_cam for f in spheres.train_frames]))
     points = np.random.default_rng(0).normal(size=(50, 3)) * 0.2
 
     def error_px() -> float:
-        assert cameras is not None
-        assert cameras.poses is not None
-        now = without_mean(truth, cameras.poses.poses())
+        now = without_mean(truth, present(cameras.poses).poses())
         squares = [
             ((camera.project(apply(inverse(a), points))[0] - camera.project(apply(inverse(b), points))[0]) ** 2).sum(1)
             for camera, a, b in zip(pool.cameras, truth, now, strict=True)
@@ -545,22 +526,8 @@ def test_displaced_cameras_return_to_their_places_in_a_trained_field(spheres, sp
 
 
 def test_resuming_goes_on_with_the_cameras_bit_for_bit(small, tmp_path):
-    settings = replace(FEW, components=Components(cameras="all"))
-    fit(small, tmp_path / "straight", settings)
-    # Schedules depend on the fraction of all steps: a training of half the steps would have another schedule.
-    with pytest.raises(KeyboardInterrupt):
-        fit(small, tmp_path / "parts", settings, stop_at=7)
-    fit(small, tmp_path / "parts", settings, resume=True)
-    ours, theirs = (load_tensors(tmp_path / name / STATE, "cpu")[0] for name in ("straight", "parts"))
-    assert ours.keys() == theirs.keys()
-    assert "parts.cameras.poses.motions" in ours
-    for name, tensor in ours.items():
-        assert torch.equal(tensor, theirs[name]), name
-    assert (ours["parts.cameras.poses.motions"] != torch.eye(4)).any()
-    frames = [read_cameras(tmp_path / name).train for name in ("straight", "parts")]
-    for one, other in zip(*frames, strict=True):
-        assert one.camera == other.camera
-        assert np.array_equal(one.world_from_cam, other.world_from_cam)
+    state = resumed_bit_for_bit(small, tmp_path, replace(FEW, components=Components(cameras="all")), stop_at=7)
+    assert (state["parts.cameras.poses.motions"] != torch.eye(4)).any()
 
 
 def test_a_run_has_the_cameras_of_its_field_and_those_of_the_scene(small, tmp_path):
@@ -577,8 +544,7 @@ def test_a_run_has_the_cameras_of_its_field_and_those_of_the_scene(small, tmp_pa
     assert held_out.camera == refined.train[0].camera != small.test_frames[0].camera
     assert np.array_equal(held_out.world_from_cam, small.test_frames[0].world_from_cam)
     # And `convert` reads them.
-    found = find_run(run)
-    assert found is not None
+    found = present(find_run(run))
     capture = parse_run(found)
     assert [frame.split for frame in capture.frames] == ["train"] * 3 + ["test"]
     assert capture.frames[0].camera == refined.train[0].camera

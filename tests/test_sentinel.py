@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 import torch
-from trainings import fit, weights
+from present import present
+from trainings import FEW, fit, weights
 
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import NON_FINITE, UserError
@@ -21,12 +22,7 @@ from nerfcli.render.pictures import render_picture
 from nerfcli.training import fitting, sentinel, step
 from nerfcli.training.optimiser import Delayed
 from nerfcli.training.runs.files import read_log
-from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.sentinel import FirstBad, is_finite, replay
-
-FEW = TrainSettings(
-    budget_seconds=None, steps=12, first_samples_per_step=2**9, samples_per_step=2**9, log2_rows=10, threads=2
-)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +54,7 @@ def test_steps_that_are_too_large_end_with_exit_5_and_a_file_that_repeats_the_fa
     assert "failure-2.safetensors has the state before the failure" in caught.value.hint
     assert "checkpoint" not in caught.value.hint  # there is none yet
     description, bad = replay(tmp_path / "run" / "failure-2.safetensors")
-    assert bad is not None
+    bad = present(bad)
     assert bad.name == "colour of samples"
     assert bad.name in description["message"]
     assert f"{bad.count} of {bad.total}" in description["message"]
@@ -66,28 +62,34 @@ def test_steps_that_are_too_large_end_with_exit_5_and_a_file_that_repeats_the_fa
     tensors, content = load_tensors(tmp_path / "run" / "failure-2.safetensors", "cpu")
     of_gpu = {name: torch.zeros(16, dtype=torch.uint8) for name in ("generator", "batch.after_draw")}
     save_tensors(tmp_path / "gpu.safetensors", tensors | of_gpu, content)
-    bad = replay(tmp_path / "gpu.safetensors")[1]
-    assert bad is not None
-    assert bad.name == "colour of samples"
+    assert present(replay(tmp_path / "gpu.safetensors")[1]).name == "colour of samples"
     assert not (tmp_path / "run" / "field.safetensors").exists()
 
 
-def test_a_failure_is_passed_with_smaller_steps_and_counted(views, tmp_path, monkeypatch):
+def poisoned_once(scene: Capture, run: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[list[str], str]:
+    """Train with a wrong rate in the eighth step; return the messages, and the one of the failure.
+
+    The table comes first among what the rate spoils, and the loss shows it a step later.
+    """
     poisoned = with_rate_factors(lambda state: math.nan if state.step == 7 and state.rollbacks == 0 else 1.0)
-    monkeypatch.setattr(fitting, "update", poisoned)
-    monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)
-    reported = reported_by(views, tmp_path / "run")
+    with monkeypatch.context() as patched:
+        patched.setattr(fitting, "update", poisoned)
+        patched.setattr(sentinel, "SNAPSHOT_EVERY", 4)
+        reported = reported_by(scene, run)
     (line,) = [line for line in reported if "continuing from step" in line]
-    # The rate is wrong in the eighth step; the table comes first among what it spoils. The loss shows it a step later.
     assert line.startswith("table is not finite at step 8")
+    assert load_tensors(run / "failure-8.safetensors", "cpu")[1]["state"]["step"] == 7
+    return reported, line
+
+
+def test_a_failure_is_passed_with_smaller_steps_and_counted(views, tmp_path, monkeypatch):
+    reported, line = poisoned_once(views, tmp_path / "run", monkeypatch)
     assert "continuing from step 4 with 0.5 of the learning rate (1 of 3 retries)" in line
     assert reported[-1].startswith("numbers became non-finite 1 times")
     last = read_log(tmp_path / "run")[-1]
     assert (last["step"], last["rollbacks"]) == (12, 1)
     load_model(tmp_path / "run" / "field.safetensors", "cpu")  # which refuses what is not finite
-    tensors, description = load_tensors(tmp_path / "run" / "failure-8.safetensors", "cpu")
-    assert description["state"]["step"] == 7
-    assert is_finite(tensors["field.table"])
+    assert is_finite(load_tensors(tmp_path / "run" / "failure-8.safetensors", "cpu")[0]["field.table"])
 
 
 def test_the_way_back_is_exact(views, tmp_path, monkeypatch):
@@ -137,15 +139,7 @@ def test_a_fault_that_does_not_come_back_changes_nothing(bad_call, on_gpu, views
 def test_where_no_two_runs_are_the_same_a_failure_is_found_all_the_same(views, tmp_path, monkeypatch):
     """A fault that does not come back is put down to a device that does not repeat its results."""
     monkeypatch.setattr(NumbaBackend, "__init__", lambda self, device: setattr(self, "deterministic", False))
-    poisoned = with_rate_factors(lambda state: math.nan if state.step == 7 and state.rollbacks == 0 else 1.0)
-    with monkeypatch.context() as patched:
-        patched.setattr(fitting, "update", poisoned)
-        patched.setattr(sentinel, "SNAPSHOT_EVERY", 4)
-        reported = reported_by(views, tmp_path / "poisoned")
-    (line,) = [line for line in reported if "continuing from step" in line]
-    assert line.startswith("table is not finite at step 8")
-    _, description = load_tensors(tmp_path / "poisoned" / "failure-8.safetensors", "cpu")
-    assert description["state"]["step"] == 7
+    poisoned_once(views, tmp_path / "poisoned", monkeypatch)
     make_flaky(monkeypatch, 9)
     reported = reported_by(views, tmp_path / "flaky")
     assert any("this device does not repeat results exactly" in line for line in reported)
@@ -178,9 +172,8 @@ def test_the_first_bad_tensor_is_found_with_its_rays(poison):
     watch.rows("first", good, rays)
     watch.rows("second", bad, rays)
     watch.values("third", bad)
-    assert watch.found is not None
-    assert (watch.found.name, watch.found.count, watch.found.total) == ("second", 3, 18)
-    assert watch.found.rays == (4, 9)
+    found = present(watch.found)
+    assert (found.name, found.count, found.total, found.rays) == ("second", 3, 18, (4, 9))
 
 
 def test_gradients_are_looked_at_in_the_order_in_which_they_come():
@@ -191,8 +184,8 @@ def test_gradients_are_looked_at_in_the_order_in_which_they_come():
     watch.rows("x", x, torch.tensor([3, 8]))
     watch.rows("root", root, torch.tensor([3, 8]))
     root.sum().backward()
-    assert watch.found is not None
-    assert (watch.found.name, watch.found.rays) == ("gradient of x", (8,))
+    found = present(watch.found)
+    assert (found.name, found.rays) == ("gradient of x", (8,))
 
 
 def test_replay_of_something_else_is_refused(spheres_run):

@@ -82,9 +82,8 @@ def test_dry_run_prints_the_plan_and_writes_nothing(capture: Path) -> None:
     assert result.exit_code == 0, result.stderr
     printed = json.loads(result.stdout)
     assert (printed["path"], printed["seconds"], printed["steps"]) == (str(capture), 90, None)
-    assert (
-        CliRunner().invoke(app, ["train", str(capture), "--dry-run"]).stdout.startswith(f"{capture}: 4 training photos")
-    )
+    printed = CliRunner().invoke(app, ["train", str(capture), "--dry-run"]).stdout
+    assert printed.startswith(f"{capture}: 4 training photos")
     assert not capture.with_name("spheres-run").exists()
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from present import present
 
 from nerfcli.captures.capture import Capture
 from nerfcli.field.exposure import exposed
@@ -140,8 +141,7 @@ def test_large_tables_have_their_levels_by_steps(trials, monkeypatch, rows_of_la
     monkeypatch.setattr("nerfcli.field.hash_field.DETAILED_LOG2_ROWS", rows_of_large)
     monkeypatch.setattr("nerfcli.training.schedule.LARGE_TABLE_STEPS", 4)
     fitting = fitting_of(trials, Components(view=0, cameras=cameras))
-    rows = fitting.field.rows()
-    assert rows is not None
+    rows = present(fitting.field.rows())
     fresh = rows.detach().clone()
     moved = []
     for _ in learning:
@@ -155,8 +155,7 @@ def test_cameras_learn_from_the_fork_on(trials, start):
     fitting = fitting_of(trials, Components(view=0, cameras="poses"), cameras_from=0.6)
     trials._take_up(fitting, start)
     assert fitting.appearance.cameras is not None
-    assert fitting.appearance.cameras.poses is not None
-    motions = fitting.appearance.cameras.poses.motions
+    motions = present(fitting.appearance.cameras.poses).motions
     given = motions.clone()
     fitting.advance(0.6)
     assert torch.equal(motions, given)
@@ -199,9 +198,8 @@ def test_trials_use_the_lens_found_before(spheres):
         across = directions / (directions @ axis)[:, None]
         return float((across[1] - across[0]).norm())
 
-    assert width(fitting.appearance.refine_cameras(drawn).directions) == pytest.approx(
-        width(drawn.directions) / 1.05, rel=1e-5
-    )
+    refined = fitting.appearance.refine_cameras(drawn).directions
+    assert width(refined) == pytest.approx(width(drawn.directions) / 1.05, rel=1e-5)
 
 
 def test_blocks_that_judge_are_not_learned_from(trials):
