@@ -40,12 +40,8 @@ class Depth:
 
 @dataclass(frozen=True)
 class RayTermination:
-    """All depths of a ray by name, and the start of its heaviest interval.
-
-    Args:
-        depths: opacity, transmittance, conditional, spread, max-weight, and `QUANTILES`.
-        anchor: start of the interval in which most light ends; NaN without light.
-    """
+    """The depths of a ray: opacity, transmittance, conditional, spread, max-weight, and `QUANTILES`; and the start of
+    the interval in which most light ends, NaN without light."""
 
     depths: dict[str, Depth]
     anchor: float

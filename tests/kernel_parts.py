@@ -1,9 +1,26 @@
-"""Fields evaluated at single points."""
+"""Fields evaluated at single points, and fields whose density is known."""
 
+import math
+from types import SimpleNamespace
+
+import torch
 from torch import Tensor
 
 from nerfcli.field.interface import Field
-from nerfcli.kernels import HashGrid, reference, spherical_harmonics
+from nerfcli.kernels import HashGrid, backend_for, reference, spherical_harmonics
+
+
+class KnownField:
+    """A field that is its own medium, at any detail; records the requested detail. Subclasses have a `density`."""
+
+    def __init__(self, contraction: str = "none", *, detailed: bool = True):
+        self.settings = SimpleNamespace(contraction=contraction, detailed=detailed)
+        self.backend = backend_for(torch.device("cpu"), torch.float64)
+        self.detail = math.nan
+
+    def medium(self, detail: float) -> "KnownField":
+        self.detail = detail
+        return self
 
 
 def density_of(field: Field, coordinates: Tensor) -> Tensor:

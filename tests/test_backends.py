@@ -12,9 +12,11 @@ from typing import Any
 import pytest
 import torch
 from oracles import march_through_slabs
+from present import present
 from torch import Tensor
 
 from nerfcli import kernels
+from nerfcli.field.fourier_field import FourierFieldSettings
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.field.kinds import fresh_field
@@ -35,70 +37,70 @@ from nerfcli.kernels.contraction import cube_widths
 from nerfcli.kernels.numba_cpu.backend import NumbaBackend
 
 CPU = torch.device("cpu")
-BACKENDS = {"numba_cpu": NumbaBackend, "reference": Backend}
 COMPILED = HashFieldSettings(contraction="l2", log2_rows=8, coarsest=4, finest=16)
 MEDIA: dict[str, FieldSettings] = {
     "compiled sizes": COMPILED,
     "pixels of some width": replace(COMPILED, antialias=True),
     "no hash grid": VoxelFieldSettings(contraction="l2", view_degree=1, log2_vertices=9),
+    "no rows": FourierFieldSettings(contraction="none", octaves=2, width=16, layers=2),
 }
 
 
-def field_of(name: str, dtype: torch.dtype, wanted: str) -> Field:
+def field_of(settings: FieldSettings, backend: Backend, dtype: torch.dtype, device: torch.device = CPU) -> Field:
+    """Return a random field, of numbers that float16 holds, in which GPU kernels read them."""
     torch.manual_seed(0)
-    field = fresh_field(MEDIA[name])
-    rows = field.rows()
-    assert rows is not None
+    field = fresh_field(settings)
     with torch.no_grad():
-        rows.normal_(0.0, 0.5)
-    field = field.to(dtype)
-    field.backend = BACKENDS[wanted](CPU)
+        if (rows := field.rows()) is not None:
+            rows.normal_(0.0, 0.5)
+        for parameter in field.parameters():
+            parameter.copy_(parameter.half())
+    field = field.to(device, dtype)
+    field.backend = backend
     return field
 
 
-def rays_and_march(count: int, dtype: torch.dtype, *, empty: bool = False) -> tuple[Rays, March]:
+def rays_and_march(
+    count: int, dtype: torch.dtype, device: torch.device = CPU, *, contraction: str = "l2", empty: bool = False
+) -> tuple[Rays, March]:
     g = torch.Generator().manual_seed(count)
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=g), dim=-1)
     origins = -1.5 * directions + 0.3 * torch.randn(count, 3, generator=g)
     jitter, cones = torch.rand(count, generator=g), 0.05 * torch.rand(count, generator=g)
     occupied = torch.rand(8, 8, 8, generator=g) > (1.0 if empty else 0.4)
-    edges = torch.linspace(0.3, 4.0, 40).to(dtype)
-    rays = Rays(*(values.to(dtype) for values in (origins, directions, jitter, cones)))
-    return rays, March(edges, occupied, "l2", 7.0)
+    edges = torch.linspace(0.3, 4.0, 40).to(device, dtype)
+    rays = Rays(*(values.to(device, dtype) for values in (origins, directions, jitter, cones)))
+    return rays, March(edges, occupied.to(device), contraction, 7.0)
 
 
 def wide(rays: Rays) -> Rays:
     """Return the rays with pixels wider than the cells of the grids."""
-    assert rays.cones is not None
-    return rays._replace(cones=30 * rays.cones)
+    return rays._replace(cones=30 * present(rays.cones))
 
 
-def learned(
-    name: str, wanted: str, count: int, *, dtype: torch.dtype, targets: Targets, with_sink: bool
-) -> dict[str, Tensor]:
+def learned(field: Field, count: int, *, targets: Targets, with_sink: bool) -> dict[str, Tensor]:
     """Return what a training step gets from some rays, and the gradients of a randomly weighted sum of it."""
-    field = field_of(name, dtype, wanted)
-    rays, march = rays_and_march(count, dtype)
+    rows, first = field.rows(), next(field.parameters())
+    like = {"dtype": first.dtype, "device": first.device}
+    rays, march = rays_and_march(count, **like, contraction=field.settings.contraction)
     rays = wide(rays)._replace(origins=rays.origins.requires_grad_(), directions=rays.directions.requires_grad_())
     g = torch.Generator().manual_seed(9)
-    background = torch.rand(count, 3, generator=g).to(dtype)
-    rows = field.rows()
-    assert rows is not None
+    background = torch.rand(count, 3, generator=g).to(**like)
     # Gradients are added to the ones that the sink already contains.
-    if with_sink:
+    if with_sink and rows is not None:
         field.table_grad = torch.ones_like(rows, requires_grad=False)
-    distances = None if targets.distances is None else targets.distances[:count].to(dtype)
-    seen = field.backend.render_rays(
-        rays, march, field.medium(), targets._replace(distances=distances), background=background
-    )
-    total = torch.zeros((), dtype=dtype)
+    distances = None if targets.distances is None else targets.distances[:count].to(**like)
+    targets = targets._replace(distances=distances)
+    seen = field.backend.render_rays(rays, march, field.medium(), targets, background=background)
+    total = torch.zeros((), **like)
     for values in seen[:4]:
-        total = total + (values * torch.randn(values.shape, generator=g).to(dtype)).sum()
+        total = total + (values * torch.randn(values.shape, generator=g).to(**like)).sum()
     total.backward()
-    assert (rows.grad is None) == with_sink or not len(rays.origins)
     gradients = {f"gradient of {key}": value.grad for key, value in field.named_parameters() if value is not rows}
     gradients |= {"gradient of origins": rays.origins.grad, "gradient of directions": rays.directions.grad}
-    gradients["gradient of rows"] = rows.grad if field.table_grad is None else field.table_grad - 1.0
+    if rows is not None:
+        assert (rows.grad is None) == with_sink or not len(rays.origins)
+        gradients["gradient of rows"] = rows.grad if field.table_grad is None else field.table_grad - 1.0
     return {**seen._asdict(), **{key: value for key, value in gradients.items() if value is not None}}
 
 
@@ -128,9 +130,9 @@ def test_a_training_gets_what_the_reference_gives_in_float64(name, count, branch
     with_sink = branch in ("near", "all")
     targets = BRANCHES[branch]
     given = {"targets": targets, "with_sink": with_sink}
-    exact = learned(name, "reference", count, dtype=torch.float64, **given)
-    for wanted in ("numba_cpu", "reference"):
-        fast = learned(name, wanted, count, dtype=torch.float32, **given)
+    exact = learned(field_of(MEDIA[name], Backend(CPU), torch.float64), count, **given)
+    for backend in (NumbaBackend(CPU), Backend(CPU)):
+        fast = learned(field_of(MEDIA[name], backend, torch.float32), count, **given)
         assert torch.equal(fast["samples"], exact["samples"])  # no sample is kept by only one for these seeds
         # float32 coordinates are off by 1e-7, which is 1e-6 of a cell of 1/16; the slope of log density adds more.
         assert_agree(fast, exact, relative=1e-3)
@@ -139,36 +141,30 @@ def test_a_training_gets_what_the_reference_gives_in_float64(name, count, branch
 @pytest.mark.parametrize("name", MEDIA)
 @pytest.mark.parametrize("count", [0, 1, 5, 123])
 def test_a_picture_is_what_the_reference_gives_in_float64(name, count):
-    def seen(wanted: str, dtype: torch.dtype) -> RaysSeen:
-        field = field_of(name, dtype, wanted)
-        rays, march = rays_and_march(count, dtype)
+    def seen(backend: Backend, dtype: torch.dtype) -> RaysSeen:
+        field = field_of(MEDIA[name], backend, dtype)
+        rays, march = rays_and_march(count, dtype, contraction=field.settings.contraction)
         background = torch.tensor([0.25, 0.5, 1.0], dtype=dtype)
-        return field.backend.trace_rays(
-            rays, march, field.medium(), TraceOptions((0.25, 0.5), 1e-3), background=background
-        )
+        options = TraceOptions((0.25, 0.5), 1e-3)
+        return field.backend.trace_rays(rays, march, field.medium(), options, background=background)
 
-    exact = seen("reference", torch.float64)
-    for wanted in ("numba_cpu", "reference"):
-        fast = seen(wanted, torch.float32)
+    exact = seen(Backend(CPU), torch.float64)
+    for backend in (NumbaBackend(CPU), Backend(CPU)):
+        fast = seen(backend, torch.float32)
         assert torch.equal(fast.intervals.offsets, exact.intervals.offsets)
         pairs = {"rgb": (fast.rgb, exact.rgb), "error": (fast.truncation_error, exact.truncation_error)}
         for key in ("opacity", "transmittance", "mean", "spread", "quantiles"):
             pairs[key] = (getattr(fast.ends, key), getattr(exact.ends, key))
         for key, (value, expected) in pairs.items():
             torch.testing.assert_close(
-                value.double(),
-                expected,
-                rtol=1e-3,
-                atol=2e-5,
-                equal_nan=True,
-                msg=lambda text, key=key: f"{key} {text}",
+                value.double(), expected, rtol=1e-3, atol=2e-5, equal_nan=True, msg=f"{key}: {value}, {expected}"
             )
 
 
 @pytest.mark.parametrize("negligible", [1e-3, 0.05, 0.5])
 def test_compiled_pictures_stay_within_their_bound(negligible):
     """More rays than a thread handles at a time; some of these rays traced alone give the same bits."""
-    field = field_of("compiled sizes", torch.float32, "numba_cpu")
+    field = field_of(COMPILED, NumbaBackend(CPU), torch.float32)
     rays, march = rays_and_march(700, torch.float32)
     background = torch.rand(700, 3, generator=torch.Generator().manual_seed(1))
     seen, whole = (
@@ -193,11 +189,8 @@ def test_compiled_pictures_stay_within_their_bound(negligible):
 
 def test_compiled_pictures_leave_out_no_more_of_a_ray_than_they_may():
     """Samples in steps so short that each may be left out: all of them together may not."""
-    field, (rays, march), negligible = (
-        field_of("compiled sizes", torch.float32, "numba_cpu"),
-        rays_and_march(100, torch.float32),
-        0.05,
-    )
+    field, negligible = field_of(COMPILED, NumbaBackend(CPU), torch.float32), 0.05
+    rays, march = rays_and_march(100, torch.float32)
     march = march._replace(edges=torch.linspace(0.3, 4.0, 600), max_optical_depth=1e9)
     options = TraceOptions(negligible=negligible)
     seen = field.backend.trace_rays(rays, march, field.medium(), options, background=torch.zeros(3))
@@ -207,7 +200,7 @@ def test_compiled_pictures_leave_out_no_more_of_a_ray_than_they_may():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_sums_along_rays_are_those_of_a_double_loop(dtype):
     """Colour, transmittance, distortion and distance of light from its target, from the samples shown to `trace`."""
-    field = field_of("compiled sizes", dtype, "numba_cpu" if dtype == torch.float32 else "reference")
+    field = field_of(COMPILED, (NumbaBackend if dtype == torch.float32 else Backend)(CPU), dtype)
     rays, march = rays_and_march(5, dtype)
     distances, background = torch.tensor([1.2, 1.9], dtype=dtype), torch.rand(5, 3, dtype=dtype)
     shown: dict[str, Tensor] = {}
@@ -231,11 +224,8 @@ def test_sums_along_rays_are_those_of_a_double_loop(dtype):
         weights, passing, colour = march_through_slabs(density[part].tolist(), lengths, rgb[part].tolist(), behind)
         spans = list(zip(contracted[0][part], contracted[1][part], strict=True))
         middles = [(near + far) / 2 for near, far in spans]
-        pairs = sum(
-            w * v * abs(m - n)
-            for w, m in zip(weights, middles, strict=True)
-            for v, n in zip(weights, middles, strict=True)
-        )
+        weighted = list(zip(weights, middles, strict=True))
+        pairs = sum(w * v * abs(m - n) for w, m in weighted for v, n in weighted)
         own = sum(w * w * (far - near) for w, (near, far) in zip(weights, spans, strict=True)) / 3
         expected[0].append(colour.tolist())
         expected[1].append(passing)
@@ -277,10 +267,9 @@ def samples_by_hand(field: Field, rays: Rays, march: March) -> list[list[tuple[f
 
 
 def widths_by_hand(rays: Rays, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
-    assert rays.cones is not None
     index, middles = kernels.ray_indices(offsets), (starts + ends) / 2
     places = rays.origins[index] + rays.directions[index] * middles[:, None]
-    return cube_widths(places, rays.cones[index] * middles, "l2")
+    return cube_widths(places, present(rays.cones)[index] * middles, "l2")
 
 
 def radiance_by_hand(field: Field, rays: Rays, kept: list[list[tuple[float, float]]]) -> tuple[Tensor, ...]:
@@ -290,7 +279,7 @@ def radiance_by_hand(field: Field, rays: Rays, kept: list[list[tuple[float, floa
     index = torch.tensor([ray for ray, spans in enumerate(kept) for _ in spans], dtype=torch.int64)
     offsets = torch.tensor([0, *torch.tensor([len(spans) for spans in kept]).cumsum(0).tolist()])
     places = rays.origins[index] + rays.directions[index] * ((starts + ends) / 2)[:, None]
-    coordinates = kernels.grid_coordinates(places, "l2")
+    coordinates = kernels.grid_coordinates(places, field.settings.contraction)
     medium = field.medium()
     if isinstance(medium, HashGrid):
         widths = widths_by_hand(rays.detached(), starts, ends, offsets) if medium.antialias else None
@@ -306,12 +295,10 @@ def radiance_by_hand(field: Field, rays: Rays, kept: list[list[tuple[float, floa
 @pytest.mark.parametrize("name", MEDIA)
 def test_rays_of_a_training_are_single_operations_one_after_the_other(name, near):
     """Values and gradients by a loop, independent of `kernels.composition`, which both backends share."""
-    field = field_of(name, torch.float64, "reference")
-    rays, march = rays_and_march(4, torch.float64)
-    rays, march = (
-        wide(rays)._replace(origins=rays.origins + 1.2 * rays.directions),
-        march._replace(edges=UNEVEN, max_optical_depth=0.4),
-    )
+    field = field_of(MEDIA[name], Backend(CPU), torch.float64)
+    rays, march = rays_and_march(4, torch.float64, contraction=field.settings.contraction)
+    rays = wide(rays)._replace(origins=rays.origins + 1.2 * rays.directions)
+    march = march._replace(edges=UNEVEN, max_optical_depth=0.4)
     background = torch.rand(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
 
     def gradients(loss: Tensor, given: Rays) -> list[Tensor | None]:
@@ -344,7 +331,7 @@ def test_rays_of_a_training_are_single_operations_one_after_the_other(name, near
         colours.append(colour + left * background[ray])
         passing.append(left)
     expected = gradients((torch.stack(colours) * background.flip(0)).sum() + torch.stack(passing).square().sum(), given)
-    assert int(sums.samples) == sum(map(len, kept)) > 15
+    assert int(sums.samples) == sum(map(len, kept)) > 10
     torch.testing.assert_close(sums.rgb, torch.stack(colours), rtol=1e-9, atol=1e-12)
     torch.testing.assert_close(sums.transmittance, torch.stack(passing), rtol=1e-9, atol=1e-12)
     for value, wanted in zip(found, expected, strict=True):
@@ -356,8 +343,8 @@ def test_rays_of_a_training_are_single_operations_one_after_the_other(name, near
 @pytest.mark.parametrize("name", MEDIA)
 def test_rays_of_a_picture_are_single_operations_one_after_the_other(name):
     """Colours of negligible samples are replaced by grey; the bound covers the error of that and of the early stop."""
-    field = field_of(name, torch.float64, "reference")
-    rays, march = rays_and_march(6, torch.float64)
+    field = field_of(MEDIA[name], Backend(CPU), torch.float64)
+    rays, march = rays_and_march(6, torch.float64, contraction=field.settings.contraction)
     rays, march, negligible = wide(rays), march._replace(edges=UNEVEN, max_optical_depth=0.4), 0.3
     background = torch.rand(6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
     options = TraceOptions(negligible=negligible)
@@ -382,17 +369,16 @@ def test_rays_of_a_picture_are_single_operations_one_after_the_other(name):
         torch.testing.assert_close(seen.rgb[ray], colour + left * background[ray], rtol=1e-9, atol=1e-12)
         assert float(seen.truncation_error[ray]) == pytest.approx(error, rel=1e-9)
         # The error of everything that marching left out is within the bound.
-        whole = field.backend.trace_rays(
-            rays, march._replace(max_optical_depth=1e9), field.medium(), background=background
-        )
+        everything = march._replace(max_optical_depth=1e9)
+        whole = field.backend.trace_rays(rays, everything, field.medium(), background=background)
         assert (whole.rgb[ray] - seen.rgb[ray]).abs().max() <= error * (1 + 1e-9) + 1e-12
-    assert greys > 2
+    assert greys > 0
     assert stops > 0
 
 
-@pytest.mark.parametrize("wanted", ["numba_cpu", "reference"])
-def test_rays_that_meet_nothing_see_the_background(wanted):
-    field = field_of("compiled sizes", torch.float32, wanted)
+@pytest.mark.parametrize("backend", [NumbaBackend(CPU), Backend(CPU)], ids=lambda backend: backend.name)
+def test_rays_that_meet_nothing_see_the_background(backend):
+    field = field_of(COMPILED, backend, torch.float32)
     rays, march = rays_and_march(5, torch.float32, empty=True)
     background = torch.rand(5, 3)
     targets = Targets(1.0, True, torch.tensor([1.0]))
@@ -409,7 +395,7 @@ def test_rays_that_meet_nothing_see_the_background(wanted):
 
 def test_what_marching_has_computed_is_not_computed_again(monkeypatch):
     """The step with gradients reuses the codes of samples from marching."""
-    field = field_of("compiled sizes", torch.float32, "numba_cpu")
+    field = field_of(COMPILED, NumbaBackend(CPU), torch.float32)
     rays, march = rays_and_march(5, torch.float32)
     rays = rays._replace(origins=rays.origins.requires_grad_())
     handed: list[bool] = []
@@ -434,11 +420,17 @@ def without_numba(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     kernels._numba_cpu.cache_clear()
 
 
-def test_without_numba_the_reference_is_taken_with_one_warning(without_numba, recwarn):
-    names = [kernels.backend_for(CPU, torch.float32).name for _ in range(3)]
-    assert names == ["reference"] * 3
+def one_warning_for_the_reference(recwarn: pytest.WarningsRecorder, device: str, *dtypes: torch.dtype) -> str:
+    """Return the only warning with which the reference is taken several times."""
+    names = {kernels.backend_for(torch.device(device), dtype).name for dtype in dtypes}
+    assert names == {"reference"}
     (warning,) = recwarn
-    assert "Numba does not work on this machine" in str(warning.message)
+    return str(warning.message)
+
+
+def test_without_numba_the_reference_is_taken_with_one_warning(without_numba, recwarn):
+    said = one_warning_for_the_reference(recwarn, "cpu", *[torch.float32] * 3)
+    assert "Numba does not work on this machine" in said
 
 
 @pytest.mark.parametrize("swallowed", [ImportError, None])
@@ -481,18 +473,14 @@ def test_a_gpu_without_working_kernels_takes_the_reference_with_one_warning(with
     for name in ("cuda", "cuda:1", "cuda:1"):
         assert kernels.backend_for(torch.device(name), torch.float32).name == "reference"
     assert kernels.backend_for(torch.device("cuda"), torch.float64).name == "reference"  # the default for float64
-    assert [str(w.message) for w in recwarn] == [
-        f"the GPU kernels cannot be used (no launch on {index}); using plain torch, which is many times slower"
-        for index in (0, 1)
-    ]
+    slow = "the GPU kernels cannot be used (no launch on {}); using plain torch, which is many times slower"
+    assert [str(warning.message) for warning in recwarn] == [slow.format(index) for index in (0, 1)]
 
 
 def test_without_triton_the_reference_is_taken_with_one_warning(with_gpu, monkeypatch, recwarn):
     monkeypatch.setitem(sys.modules, "nerfcli.kernels.triton_cuda", None)
-    names = [kernels.backend_for(torch.device("cuda"), torch.float32).name for _ in range(3)]
-    assert names == ["reference"] * 3
-    (warning,) = recwarn
-    assert "Triton does not work on this machine" in str(warning.message)
+    said = one_warning_for_the_reference(recwarn, "cuda", *[torch.float32] * 3)
+    assert "Triton does not work on this machine" in said
 
 
 def test_a_gpu_with_working_kernels_takes_them(with_gpu, monkeypatch):
@@ -505,11 +493,8 @@ def test_a_gpu_with_working_kernels_takes_them(with_gpu, monkeypatch):
 
 def test_half_precision_on_a_gpu_takes_the_reference_with_one_warning(with_gpu, monkeypatch, recwarn):
     monkeypatch.setattr(kernels, "_why_not_triton", lambda index: None)
-    names = [kernels.backend_for(torch.device("cuda"), torch.float16).name for _ in range(2)]
-    names.append(kernels.backend_for(torch.device("cuda"), torch.float64).name)
-    assert names == ["reference"] * 3
-    (warning,) = recwarn
-    assert "the GPU kernels cannot be used (float32 is supported, not float16)" in str(warning.message)
+    said = one_warning_for_the_reference(recwarn, "cuda", torch.float16, torch.float16, torch.float64)
+    assert "the GPU kernels cannot be used (float32 is supported, not float16)" in said
 
 
 def test_without_a_gpu_its_kernels_say_why_they_do_not_work():
@@ -521,12 +506,8 @@ def test_without_a_gpu_its_kernels_say_why_they_do_not_work():
 
 
 def test_what_repeats_bit_for_bit_says_so():
-    def deterministic(backend: Backend) -> bool:
-        return backend.deterministic
-
-    assert deterministic(kernels.backend_for(CPU, torch.float32))
-    assert deterministic(kernels.backend_for(CPU, torch.float64))
-    assert not deterministic(kernels.backend_for(torch.device("cuda"), torch.float32))
+    assert all(kernels.backend_for(CPU, dtype).deterministic for dtype in (torch.float32, torch.float64))
+    assert not kernels.backend_for(torch.device("cuda"), torch.float32).deterministic
 
 
 @pytest.mark.parametrize("size", [{"levels": 3}, {"width": 16}, {"width": 64}, {"levels": 16, "features": 2}])

@@ -192,11 +192,8 @@ def test_light_that_passes_counts_at_the_background():
     mean, left = depth.conditional(weights, places, offsets), torch.tensor([1 / 16], dtype=torch.float64)
     assert mean.item() == pytest.approx(5 / 3, rel=1e-15)
     ends = RayTermination(1 - left, left, mean, mean, mean, mean, mean.new_empty(1, 0))
-    for convention, far, wanted in (
-        ("moment", 4.0, 25 / 16),
-        ("background", 4.0, 29 / 16),
-        ("background", 100.0, 7.8125),
-    ):
+    means = [("moment", 4.0, 25 / 16), ("background", 4.0, 29 / 16), ("background", 100.0, 7.8125)]
+    for convention, far, wanted in means:
         request = DepthRequest(convention, "ray", background_distance=far)
         found = requested(request, ends, background_distance=mean.new_tensor([far]))
         assert found.item() == pytest.approx(wanted, rel=1e-15)

@@ -1,26 +1,27 @@
 """The kinds of fields: interpolation against SciPy, harmonics and features in closed form, gradients, checkpoints."""
 
 import math
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from kernel_parts import density_of, radiance_of
+from kernel_parts import radiance_of
+from present import present
 from scipy.ndimage import map_coordinates
 from scipy.special import sph_harm_y
 
-from nerfcli import kernels
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings, fourier_features
-from nerfcli.field.hash_field import HashField, HashFieldSettings
+from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.field.kinds import KINDS, fresh_field, settings_from_json
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
-from nerfcli.kernels import HashGrid, March, Rays, RaySums, Targets, numba_cpu, reference, spherical_harmonics
+from nerfcli.kernels import HashGrid, March, Rays, RaySums, Targets, spherical_harmonics
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import Model, load_model, save_model
 from nerfcli.render.trained_field import Marching
@@ -46,8 +47,7 @@ def field(request: pytest.FixtureRequest) -> Field:
     """A field of each kind whose numbers are not small."""
     torch.manual_seed(0)
     made = fresh_field(SMALL[request.param])
-    rows = made.rows()
-    if rows is not None:
+    if (rows := made.rows()) is not None:
         with torch.no_grad():
             rows.normal_()
     return made
@@ -91,9 +91,8 @@ def test_the_dense_grid_interpolates_as_scipy_does(dtype):
     coordinates = torch.cat([places(200, dtype), corners])
     volumes = field.table[:, : side**3].detach().double().numpy().reshape(settings.layers, side, side, side, 4)
     at = (coordinates.double().numpy() * settings.resolution)[:, ::-1].T  # the grid is indexed [z, y, x]
-    values = np.concatenate(
-        [map_coordinates(volumes[layer, ..., i], at, order=1)[:, None] for layer in range(4) for i in range(4)], axis=1
-    )
+    columns = [map_coordinates(volumes[layer, ..., i], at, order=1) for layer in range(4) for i in range(4)]
+    values = np.stack(columns, axis=1)
     directions = looks(len(coordinates), dtype)
     density, rgb = field.radiance(coordinates, directions, torch.arange(len(coordinates)))
     tolerance = 1e-5 if dtype == torch.float32 else 1e-12
@@ -161,65 +160,6 @@ class _Radiance(torch.nn.Module):
         return radiance_of(self.field, *inputs)
 
 
-@pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
-@pytest.mark.parametrize("kind", KINDS)
-def test_rays_see_the_definition(kind, contraction):
-    """Against the reference's march with the field's own density, cut where the optical depth reaches the limit."""
-    torch.manual_seed(0)
-    field = fresh_field(replace(SMALL[kind], contraction=contraction))
-    rows = field.rows()
-    if rows is not None:
-        with torch.no_grad():
-            rows.normal_(2.0, 1.0)
-    g = torch.Generator().manual_seed(3)
-    directions = looks(17)
-    origins, jitter = -2 * directions + 0.2 * torch.randn(17, 3, generator=g), torch.rand(17, generator=g)
-    rays = Rays(origins, directions, jitter)
-    march = March(torch.linspace(0.5, 4.0, 60), torch.rand(8, 8, 8, generator=g) > 0.4, contraction, 1e9)
-    with torch.no_grad():
-        everything = field.backend.trace_rays(rays, march, field.medium(), background=torch.zeros(3)).intervals
-        depths = everything.density * (everything.ends - everything.starts)
-        deepest = 0.3 * float(kernels.sum_along_rays(depths, everything.offsets).median())
-        march = march._replace(max_optical_depth=deepest)
-        seen = field.backend.trace_rays(rays, march, field.medium(), background=torch.zeros(3))
-        starts, ends, offsets = reference.march(rays, march)
-        kept, coordinates = [], []
-        for ray in range(17):
-            depth = 0.0
-            for i in range(int(offsets[ray]), int(offsets[ray + 1])):
-                if depth >= deepest:
-                    break
-                point = origins[ray] + directions[ray] * (starts[i] + ends[i]) / 2
-                coordinates.append(kernels.grid_coordinates(point[None], contraction))
-                density = float(density_of(field, coordinates[-1]))
-                kept.append((ray, float(starts[i]), float(ends[i]), density))
-                depth += density * float(ends[i] - starts[i])
-        samples = seen.intervals
-        index = kernels.ray_indices(samples.offsets)
-        found = torch.stack([index.float(), samples.starts, samples.ends, samples.density], dim=1)
-        np.testing.assert_allclose(found.numpy(), np.array(kept), rtol=2e-4, atol=1e-6)
-        assert len(kept) < int(offsets[-1])  # some are cut off behind others
-        density, rgb = radiance_of(field, torch.cat(coordinates), directions, index)
-        lengths = samples.ends - samples.starts
-        wanted, _, _ = reference.composite(density, rgb, lengths, offsets=samples.offsets, background=torch.zeros(3))
-        torch.testing.assert_close(seen.rgb, wanted, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("sizes", [(0, 9), (1, 9), (5, 3), (123, 40)])
-@pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
-def test_compiled_marching_is_the_reference(sizes, contraction):
-    rays, intervals = sizes
-    g = torch.Generator().manual_seed(rays)
-    directions = torch.nn.functional.normalize(torch.randn(rays, 3, generator=g), dim=-1)
-    origins, jitter = torch.randn(rays, 3, generator=g), torch.rand(rays, generator=g)
-    edges, occupied = torch.linspace(0.1, 5.0, intervals + 2), torch.rand(6, 6, 6, generator=g) > 0.5
-    given = (Rays(origins, directions, jitter), March(edges, occupied, contraction, 7.0))
-    fast, slow = numba_cpu.occupied_samples(*given), reference.occupied_samples(*given)
-    assert torch.equal(fast[3], slow[3])
-    for one, other in zip(fast[:3], slow[:3], strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
-
-
 def test_the_sink_gets_the_gradient_of_the_rows(field):
     """Against autograd, up to the order of sums; the optimiser then changes only rows that a sample touched."""
     directions, background = looks(5), torch.rand(5, 3, generator=torch.Generator().manual_seed(4))
@@ -253,16 +193,13 @@ def test_the_sink_gets_the_gradient_of_the_rows(field):
 def test_rows_of_the_hash_grid_decay_where_photos_say_little():
     """The decay of a row of value 0.1 outweighs its gradient of -1e-15: Adam's first step moves it by the full learning
     rate towards zero. Rows without a gradient stay unchanged, and a voxel's row does not decay."""
-    fields = (fresh_field(SMALL["hash"]), fresh_field(SMALL["voxels"]))
-    for made, towards_zero in zip(fields, (1, -1), strict=True):
-        optimiser, rows = FieldOptimiser(made), made.rows()
-        assert rows is not None
-        assert made.table_grad is not None
+    for kind, towards_zero in (("hash", 1), ("voxels", -1)):
+        field = fresh_field(SMALL[kind])
+        optimiser, rows = FieldOptimiser(field), present(field.rows())
         rows.data.fill_(0.1)
-        rows_in_a_line, table_grad = rows.data.view(-1, 4), made.table_grad.view(-1, 4)
-        table_grad[3] = -1e-15
-        optimiser.step(1, 1e-3, decay=made.row_decay)
-        moved = rows_in_a_line - 0.1
+        present(field.table_grad).view(-1, 4)[3] = -1e-15
+        optimiser.step(1, 1e-3, decay=field.row_decay)
+        moved = rows.data.view(-1, 4) - 0.1
         assert (moved[:3] == 0).all()
         assert (moved[4:] == 0).all()
         assert (moved[3] * towards_zero < 0).all()
@@ -271,13 +208,11 @@ def test_rows_of_the_hash_grid_decay_where_photos_say_little():
 
 
 def training_of_two_photos(
-    scene: Capture, *, has_alpha: bool, log2_rows: int, near: float = 0.1, components: Components = DEFAULTS
+    scene: Capture, *, has_alpha: bool, log2_rows: int = 8, near: float = 0.1, components: Components = DEFAULTS
 ) -> Fitting:
-    photos = [
-        replace(photo, pixels=photo.pixels[..., : 3 + has_alpha])
-        for photo in load_photos(scene.train_frames[:2], factor=8, threads=1)
-    ]
-    pool = PixelPool(photos, Similarity(1.0, np.eye(3), np.zeros(3)), torch.device("cpu"))
+    photos = load_photos(scene.train_frames[:2], factor=8, threads=1)
+    photos = [replace(photo, pixels=photo.pixels[..., : 3 + has_alpha]) for photo in photos]
+    pool = PixelPool(photos, Similarity.identity(), torch.device("cpu"))
     settings = TrainSettings(
         budget_seconds=None, steps=9, log2_rows=log2_rows, first_samples_per_step=2**20, samples_per_step=2**20,
         components=components,
@@ -287,11 +222,9 @@ def training_of_two_photos(
 
 
 @pytest.mark.parametrize("has_alpha", [True, False])
-def test_decay_shrinks_with_the_rays_of_a_step_only_where_photos_have_alpha(
-    has_alpha, spheres: Capture, monkeypatch: pytest.MonkeyPatch
-):
+def test_decay_shrinks_with_the_rays_of_a_step_only_where_photos_have_alpha(has_alpha, spheres, monkeypatch):
     """The law of `row_decay`, and what the optimiser gets in a step of all rays that there may be."""
-    training = training_of_two_photos(spheres, has_alpha=has_alpha, log2_rows=8)
+    training = training_of_two_photos(spheres, has_alpha=has_alpha)
     full = training.field.row_decay
     assert full > 0
     assert [row_decay(training, rays) for rays in (1, 4000)] == [full, full]
@@ -304,7 +237,7 @@ def test_decay_shrinks_with_the_rays_of_a_step_only_where_photos_have_alpha(
 
 
 @pytest.mark.parametrize(("log2_rows", "most"), [(6, 16), (8, 32)])
-def test_steps_of_large_tables_have_more_rays(log2_rows, most, spheres: Capture, monkeypatch: pytest.MonkeyPatch):
+def test_steps_of_large_tables_have_more_rays(log2_rows, most, spheres, monkeypatch):
     monkeypatch.setattr(fitting, "MOST_RAYS", 16)
     monkeypatch.setattr(fitting, "ROWS_PER_RAY", 8)
     training = training_of_two_photos(spheres, has_alpha=True, log2_rows=log2_rows)
@@ -312,12 +245,9 @@ def test_steps_of_large_tables_have_more_rays(log2_rows, most, spheres: Capture,
 
 
 @pytest.mark.parametrize(("begin", "near", "wanted"), [(0.12, True, 0.4), (0.6, True, 1.0), (0.12, False, None)])
-def test_gradients_are_scaled_up_to_the_nearest_point_or_the_unit_ball(
-    begin, near, wanted, spheres: Capture, monkeypatch: pytest.MonkeyPatch
-):
+def test_gradients_are_scaled_up_to_the_nearest_point_or_the_unit_ball(begin, near, wanted, spheres, monkeypatch):
     """Rays begin at 0.3 of the distance of the nearest point."""
-    components = Components(near=near)
-    training = training_of_two_photos(spheres, has_alpha=False, log2_rows=8, near=begin, components=components)
+    training = training_of_two_photos(spheres, has_alpha=False, near=begin, components=Components(near=near))
     backend, given = training.field.backend, []
 
     def render_rays(rays: Rays, march: March, medium: HashGrid, targets: Targets, **others: Any) -> RaySums:
@@ -327,43 +257,6 @@ def test_gradients_are_scaled_up_to_the_nearest_point_or_the_unit_ball(
     monkeypatch.setattr(backend, "render_rays", render_rays)
     training.advance(0.5)
     assert given == [pytest.approx(wanted)]
-
-
-def test_marching_and_learning_see_pixels_of_the_same_width():
-    """Density and colour with gradients equal those of the march, and both weight levels by min(1, cell / width);
-    without antialias, the width has no effect."""
-    settings = HashFieldSettings(contraction="l2", log2_rows=8, coarsest=4, finest=64, antialias=True)
-    blurred, sharp = HashField(settings), HashField(replace(settings, antialias=False))
-    with torch.no_grad():
-        blurred.table.normal_()
-        sharp.load_state_dict(blurred.state_dict())
-    torch.manual_seed(0)
-    directions, background = looks(5), torch.zeros(5, 3)
-    march = March(torch.linspace(1, 3, 9), torch.ones(4, 4, 4, dtype=torch.bool), "l2", 50.0)
-    plain = sharp.backend.trace_rays(
-        Rays(-2 * directions, directions, torch.zeros(5)), march, sharp.medium(), background=background
-    )
-    for width in (1e-6, 0.05, 1e9):
-        rays = Rays(-2 * directions, directions, torch.zeros(5), torch.full((5,), width))
-        shown: dict[str, torch.Tensor] = {}
-        learned = blurred.backend.render_rays(
-            rays,
-            march,
-            blurred.medium(),
-            background=background,
-            trace=lambda name, values, index, shown=shown: shown.update({name: values}),
-        )
-        seen = blurred.backend.trace_rays(rays, march, blurred.medium(), background=background)
-        torch.testing.assert_close(shown["density of samples"], seen.intervals.density, rtol=1e-5, atol=0)
-        torch.testing.assert_close(learned.rgb, seen.rgb, rtol=1e-5, atol=1e-7)
-        assert torch.equal(sharp.backend.trace_rays(rays, march, sharp.medium(), background=background).rgb, plain.rgb)
-        whole = reference.hash_encode(shown["coordinates of samples"], blurred.table, settings.resolutions)
-        middles = (seen.intervals.starts + seen.intervals.ends) / 2
-        # All middles are inside the unit ball, where a length in coordinates is a quarter of the true one.
-        assert (middles < 3).all()
-        left = 1 / (width * middles[:, None] / 4 * torch.tensor(settings.resolutions)).clamp_min(1.0)
-        code = whole * left.repeat_interleave(4, dim=1)
-        torch.testing.assert_close(shown["code of samples"], code, rtol=1e-4, atol=1e-6)
 
 
 def test_the_state_of_the_optimiser_comes_back(field):
@@ -379,30 +272,21 @@ def test_the_state_of_the_optimiser_comes_back(field):
 
     first = FieldOptimiser(field)
     stepped(first, 1)
-    numbers = {name: value.clone() for name, value in field.state_dict().items()}
+    numbers = deepcopy(field.state_dict())
     second = FieldOptimiser(field)
     second.restore({name: value.clone() for name, value in first.state().items()})
     stepped(first, 2)
-    straight = {name: value.clone() for name, value in field.state_dict().items()}
+    straight = deepcopy(field.state_dict())
     field.load_state_dict(numbers)
     stepped(second, 2)
     for name, value in field.state_dict().items():
         assert torch.equal(value, straight[name]), name
 
 
-def model_of(field: Field) -> Model:
-    return Model(
-        field=field,
-        occupied=torch.rand(4, 4, 4) > 0.5,
-        marching=Marching(near=0.1, far=4.0, shortest_step=0.01, growth=0.0),
-        background=(0.0, 0.0, 0.0),
-        training_from_scene=Similarity.identity(),
-        unit="arbitrary",
-    )
-
-
 def test_every_kind_comes_back_bit_for_bit(field, tmp_path):
-    save_model(tmp_path / "a.safetensors", model_of(field))
+    occupied, marching = torch.rand(4, 4, 4) > 0.5, Marching(near=0.1, far=4.0, shortest_step=0.01, growth=0.0)
+    model = Model(field, occupied, marching, (0.0, 0.0, 0.0), Similarity.identity(), "arbitrary")
+    save_model(tmp_path / "a.safetensors", model)
     loaded = load_model(tmp_path / "a.safetensors", "cpu").field
     assert loaded.settings == field.settings
     assert type(loaded) is type(field)

@@ -34,26 +34,16 @@ RELATIVE = 1e-5
 
 @dataclass(frozen=True)
 class Case:
-    """Random inputs of an operation.
-
-    Args:
-        inputs: returns those of a size, in float32.
-        run: returns what a module computes from them.
-        leaves: inputs by which the gradient of a randomly weighted sum of the results is compared.
-        relative: largest error.
-        each: whether errors are relative to each number.
-        sizes: to try.
-        on_gpu: whether the GPU kernels have this operation.
-    """
+    """Random inputs of an operation, in float32, and what a module computes from them."""
 
     name: str
-    inputs: Callable[[int, torch.Generator], Inputs]
+    inputs: Callable[[int, torch.Generator], Inputs]  # of a size
     run: Callable[[ModuleType, Inputs], Inputs]
-    leaves: tuple[str, ...] = ()
-    relative: float = RELATIVE
-    each: bool = False
+    leaves: tuple[str, ...] = ()  # inputs by which the gradient of a randomly weighted sum of the results is compared
+    relative: float = RELATIVE  # largest error
+    each: bool = False  # whether errors are relative to each number
     sizes: tuple[int, ...] = SIZES
-    on_gpu: bool = True
+    on_gpu: bool = True  # whether the GPU kernels have this operation
 
 
 def offsets_of(samples: int, generator: torch.Generator) -> Tensor:
@@ -133,10 +123,8 @@ LAYERS = ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))
 
 def codes_and_layers(magnitude: float, samples: int, generator: torch.Generator) -> Inputs:
     layers = {f"layer {i}": torch.randn(shape, generator=generator) * magnitude for i, shape in enumerate(LAYERS)}
-    given = {
-        "encoded": torch.randn(samples, 32, generator=generator),
-        "harmonics": torch.randn(9, 16, generator=generator),
-    }
+    given = {"encoded": torch.randn(samples, 32, generator=generator)}
+    given["harmonics"] = torch.randn(9, 16, generator=generator)
     return {**given, **layers, "rays": torch.randint(9, (samples,), generator=generator).sort()[0]}
 
 
@@ -150,14 +138,8 @@ def rays_and_steps(reach: float, samples: int, generator: torch.Generator) -> In
     offsets = offsets_of(samples, generator)
     origins, directions = torch.randn(2, len(offsets) - 1, 3, generator=generator)
     starts = torch.rand(samples, generator=generator) * reach
-    return {
-        "origins": origins,
-        "directions": directions,
-        "starts": starts,
-        "ends": starts + 0.1 * reach,
-        "offsets": offsets,
-        "gradient": torch.randn(samples, 3, generator=generator),
-    }
+    lines = {"origins": origins, "directions": directions, "starts": starts, "ends": starts + 0.1 * reach}
+    return {**lines, "offsets": offsets, "gradient": torch.randn(samples, 3, generator=generator)}
 
 
 def ray_gradients(contraction: str, module: ModuleType, given: Inputs) -> Inputs:
@@ -224,21 +206,16 @@ def rays_through_cells(count: int, generator: torch.Generator) -> Inputs:
 
 def occupied_samples(contraction: str, module: ModuleType, given: Inputs) -> Inputs:
     rays = Rays(given["origins"], given["directions"], given["jitter"])
-    starts, ends, coordinates, offsets = module.occupied_samples(
-        rays, March(given["edges"], given["occupied"], contraction, 7.0)
-    )
+    march = March(given["edges"], given["occupied"], contraction, 7.0)
+    starts, ends, coordinates, offsets = module.occupied_samples(rays, march)
     index = module.ray_indices(offsets)
     return {"starts": starts, "ends": ends, "coordinates": coordinates, "offsets": offsets, "rays": index}
 
 
 def cases() -> Iterator[Case]:
     for magnitude in (1e-10, 1e-3, 1.0, 30.0, 1e10):
-        yield Case(
-            f"composite, densities to {magnitude:g}",
-            partial(samples_along, magnitude, 0.0),
-            composite,
-            ("density", "rgb"),
-        )
+        name, inputs = f"composite, densities to {magnitude:g}", partial(samples_along, magnitude, 0.0)
+        yield Case(name, inputs, composite, ("density", "rgb"))
     for magnitude, far in ((1e-12, 0.0), (1.0, 0.0), (1.0, 1e4), (1e6, 0.0)):
         name = f"distortion, weights to {magnitude:g} at {far:g}"
         yield Case(name, partial(weights_along, magnitude, far), distortion, ("weights",))
@@ -275,10 +252,8 @@ def cases() -> Iterator[Case]:
 
 
 @pytest.fixture(params=THREADS, ids=lambda count: f"{count} threads")
-def threads(request: pytest.FixtureRequest) -> Iterator[None]:
+def threads(request: pytest.FixtureRequest) -> None:
     torch.set_num_threads(request.param)
-    yield
-    torch.set_num_threads(2)
 
 
 def outcome(case: Case, module: ModuleType, given: Inputs) -> Outcome:
@@ -351,6 +326,5 @@ def test_hash_encode_reads_no_row_that_is_no_vertex(module):
 def test_no_rays_at_all():
     given = {name: values.to(DEVICE) for name, values in samples_along(1.0, 0.0, 0, torch.Generator()).items()}
     none = {**given, "offsets": given["offsets"][:1], "background": given["background"][:0]}
-    assert {name: len(values) for name, values in composite(FAST, none).items()} == dict.fromkeys(
-        composite(reference, {name: exact(x) for name, x in none.items()}), 0
-    )
+    wanted = composite(reference, {name: exact(x) for name, x in none.items()})
+    assert {name: len(values) for name, values in composite(FAST, none).items()} == dict.fromkeys(wanted, 0)

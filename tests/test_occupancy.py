@@ -1,14 +1,13 @@
 """nerfcli.training.open_cells: which cells are taken for empty, against a field whose density is known."""
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import pytest
 import torch
+from kernel_parts import KnownField
 from torch import Tensor
 
-from nerfcli.kernels import backend_for
 from nerfcli.render.trained_field import Marching
 from nerfcli.training.open_cells import DECAY, Occupancy, training_points
 
@@ -16,39 +15,17 @@ SIDE = 4
 EVERYTHING = slice(None)
 
 
-@dataclass(frozen=True)
-class Size:
-    """The only setting of a field that the grid reads."""
-
-    contraction: str
-
-
-class Fake:
-    """A field that is its own medium, at any detail; records the requested detail."""
-
-    def __init__(self, contraction: str = "none"):
-        self.settings = Size(contraction)
-        self.backend = backend_for(torch.device("cpu"), torch.float64)
-        self.detail = math.nan
-
-    def medium(self, detail: float) -> "Fake":
-        self.detail = detail
-        return self
-
-
-class Ramp(Fake):
+class Ramp(KnownField):
     """Density x + 10 y + 100 z in the unit cube; records where it was evaluated."""
 
-    def __init__(self, contraction: str = "none"):
-        super().__init__(contraction)
-        self.queried = torch.zeros(0, 3)
+    queried = torch.zeros(0, 3)
 
     def density(self, coordinates: Tensor) -> Tensor:
         self.queried = torch.cat([self.queried, coordinates])
         return coordinates @ torch.tensor([1.0, 10.0, 100.0])
 
 
-class Even(Fake):
+class Even(KnownField):
     """The same density everywhere."""
 
     def __init__(self, density: float):

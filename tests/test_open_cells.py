@@ -1,11 +1,12 @@
 """nerfcli.training.open_cells: which cells training rays look into, against fields and samples that are known."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from kernel_parts import KnownField
+from present import present
 from torch import Tensor
 
 from nerfcli import distributed, kernels
@@ -21,21 +22,8 @@ MARCHING = Marching(0.1, 10.0, 0.05, 0.0)
 KEEPERS = {"reference": reference.keep_largest, "numba_cpu": numba_cpu.keep_largest}
 
 
-@dataclass(frozen=True)
-class Size:
-    contraction: str = "none"
-    detailed: bool = True
-
-
-class Slab:
-    """A field of optical depth 1 per step up to x = 1/2 of the unit cube, and empty beyond; its own medium."""
-
-    def __init__(self, detailed: bool = True):
-        self.settings = Size(detailed=detailed)
-        self.backend = kernels.backend_for(CPU, torch.float64)
-
-    def medium(self, detail: float) -> "Slab":
-        return self
+class Slab(KnownField):
+    """A field of optical depth 1 per step up to x = 1/2 of the unit cube, and empty beyond."""
 
     def density(self, coordinates: Tensor) -> Tensor:
         return torch.where(coordinates[:, 0] < 0.5, 20.0, 0.0)
@@ -51,8 +39,8 @@ def refresh(cells: OpenCells, step: int) -> None:
 
 
 def visit(cells: OpenCells, where: tuple[int, int, int], depth: float) -> None:
-    assert cells.cell_depths is not None
-    cells.cell_depths[where] = max(float(cells.cell_depths[where]), depth)
+    depths = present(cells.cell_depths)
+    depths[where] = max(float(depths[where]), depth)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
@@ -66,12 +54,8 @@ def test_the_largest_value_of_a_cell_is_kept(name, threads):
     expected = before.numpy().copy()
     place = np.clip(np.floor(coordinates.numpy() * np.float32(5)).astype(int), 0, 4)
     np.maximum.at(expected, (place[:, 2], place[:, 1], place[:, 0]), values.numpy())
-    torch_threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(threads)
-        KEEPERS[name](before, coordinates, values)
-    finally:
-        torch.set_num_threads(torch_threads)
+    torch.set_num_threads(threads)
+    KEEPERS[name](before, coordinates, values)
     assert np.array_equal(before.numpy(), expected)
 
 
@@ -222,9 +206,8 @@ def test_a_restored_state_goes_on_as_the_saved_one():
     visit(first, (0, 0, 1), 0.0)
     second.restore({name: tensor.clone() for name, tensor in first.state().items()})
     for turn in (1, 2):
-        if turn == 2:
-            refresh(first, turn * REFRESH_EVERY)
-            refresh(second, turn * REFRESH_EVERY)
         for step in (1, REFRESH_EVERY):
             assert torch.equal(first.at(step), second.at(step))
+        for cells in (first, second):
+            refresh(cells, (turn + 1) * REFRESH_EVERY)
     assert not second.at(1)[0, 0, 1]

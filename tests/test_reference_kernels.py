@@ -39,9 +39,8 @@ def test_splitting_an_interval_changes_nothing(seed, cut, at):
     density, lengths, rgb, offsets = random_rays(seed, [7])
     background = torch.ones(3, dtype=torch.float64)
     whole, behind, _ = reference.composite(density, rgb, lengths, offsets=offsets, background=background)
-    parts = torch.cat(
-        [lengths[:cut], lengths[cut : cut + 1] * at, lengths[cut : cut + 1] * (1 - at), lengths[cut + 1 :]]
-    )
+    cut_one = lengths[cut : cut + 1]
+    parts = torch.cat([lengths[:cut], cut_one * at, cut_one * (1 - at), lengths[cut + 1 :]])
     density, rgb = (torch.cat([x[: cut + 1], x[cut:]]) for x in (density, rgb))
     split, behind2, _ = reference.composite(density, rgb, parts, offsets=torch.tensor([0, 8]), background=background)
     torch.testing.assert_close(split, whole, rtol=1e-12, atol=1e-14)

@@ -24,9 +24,8 @@ from nerfcli.kernels.selftest.cases import MEANINGLESS, Ray, Segments
 from nerfcli.kernels.selftest.measure import MET, NOT_MET, Errors, Precision, Row, by_formula, largest_error
 from nerfcli.kernels.selftest.table import SINGLE, Check, checks, row_of
 
-DOUBLE, FLOAT, BFLOAT = (
-    Precision(str(dtype)[6:], dtype, "cpu") for dtype in (torch.float64, torch.float32, torch.bfloat16)
-)
+DTYPES = (torch.float64, torch.float32, torch.bfloat16)
+DOUBLE, FLOAT, BFLOAT = (Precision(str(dtype)[6:], dtype, "cpu") for dtype in DTYPES)
 COMPILED = Precision("compiled", torch.float32, "cpu", compiled=True)
 PRECISIONS = (DOUBLE, FLOAT, BFLOAT, COMPILED)
 # With exact answers and sizes of terms, these bounds are stricter than those of the table, in roundings.
@@ -147,9 +146,8 @@ def test_the_command_is_within_its_bounds_and_says_why_they_are_what_they_are(ow
     assert [row for row in own_rows if row.verdict == NOT_MET] == []
     assert all(row.reason and row.seconds is not None for row in own_rows)
     tried = {(row.operation, row.precision) for row in own_rows}
-    assert {
-        (operation, name) for operation in ANSWERS for name in (SINGLE, "compiled") if operation != "contract"
-    } <= tried
+    compared = set(ANSWERS) - {"contract"}
+    assert {(operation, name) for operation in compared for name in (SINGLE, "compiled")} <= tried
     assert {(operation, "bfloat16") for operation in ("composite", "ray_termination", "optical_depth_before")} <= tried
     for row in own_rows:
         if row.operation in ("ray_termination", "optical_depth_before") and not row.case.startswith("spread"):
@@ -229,10 +227,8 @@ def test_the_gradients_of_depths_are_difference_quotients_in_sixty_digits():
     for k, sigma in enumerate(ray.density):
         if sigma < h:
             continue
-        up, down = (
-            exact_depths.ray_termination(replace(ray, density=[*ray.density[:k], sigma + s * h, *ray.density[k + 1 :]]))
-            for s in (1, -1)
-        )
+        moved = [[*ray.density[:k], sigma + step, *ray.density[k + 1 :]] for step in (h, -h)]
+        up, down = (exact_depths.ray_termination(replace(ray, density=density)) for density in moved)
         for name, found in answer.items():
             quotient = (up.depths[name].value - down.depths[name].value) / (2 * h)
             defined = math.isfinite(found.value)  # what is undefined has no gradient

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from commands import nerfcli as command
+from present import present
 
 import nerfcli
 from nerfcli import Output, Reporter
@@ -66,6 +67,10 @@ def photographed(gaussians: Gaussians) -> list[LoadedPhoto]:
     return [LoadedPhoto(frame, np.rint(255 * rgb).astype(np.uint8), None) for frame, rgb in pictures]
 
 
+def photos_of(gaussians: Gaussians) -> list[refinement.SplatPhoto]:
+    return splat_photos(photographed(gaussians), np.zeros((6, 3)), splats_from_scene=IDENTITY, near=0.0)
+
+
 def error_of(state: Refinement, photos: list[refinement.SplatPhoto]) -> float:
     black = np.zeros(3, np.float32)
     return float(np.mean([np.abs(render_splats(state.rows, p.view, black).image - p.target(black)) for p in photos]))
@@ -79,38 +84,28 @@ def perturbed() -> Refinement:
 
 def test_refinement_recovers_what_was_photographed() -> None:
     """Gaussians that were moved by a third of their size and faded give the photos again, to 2 of 255 levels."""
-    photos = splat_photos(photographed(wall()), np.zeros((6, 3)), splats_from_scene=IDENTITY, near=0.0)
-    state = perturbed()
+    photos, state = photos_of(wall()), perturbed()
     assert error_of(state, photos) > 0.05
     refine(state, photos, background=(0, 0, 0), steps=300)
     assert error_of(state, photos) < 0.008
 
 
 def test_refinement_by_steps_has_the_same_bits_with_any_threads() -> None:
-    photos = splat_photos(photographed(wall()), np.zeros((6, 3)), splats_from_scene=IDENTITY, near=0.0)
-    before, found = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            state = perturbed()
-            refine(state, photos, background=(0, 0, 0), steps=12)
-            found.append(state.rows)
-    finally:
-        torch.set_num_threads(before)
-    np.testing.assert_array_equal(*found)
+    photos, one, other = photos_of(wall()), perturbed(), perturbed()
+    for threads, state in ((1, one), (2, other)):
+        torch.set_num_threads(threads)
+        refine(state, photos, background=(0, 0, 0), steps=12)
+    np.testing.assert_array_equal(one.rows, other.rows)
 
 
 def test_gains_of_photos_are_divided_out() -> None:
     """Photos taken with half and twice the exposure ask for the same splats; levels that saturate excepted."""
     photos = photographed(wall())
     gains = np.log(np.array([[0.5] * 3, [1.2, 1.0, 0.9]] * 3))
-    taken = [
-        replace(
-            photo, pixels=np.rint(255 * exposed(torch.tensor(photo.pixels / 255.0), torch.tensor(g)).numpy().clip(0, 1))
-        )
-        for photo, g in zip(photos, gains, strict=True)
-    ]
-    taken = [replace(photo, pixels=photo.pixels.astype(np.uint8)) for photo in taken]
+    taken = []
+    for photo, gain in zip(photos, gains, strict=True):
+        seen = exposed(torch.tensor(photo.pixels / 255.0), torch.tensor(gain)).numpy().clip(0, 1)
+        taken.append(replace(photo, pixels=np.rint(255 * seen).astype(np.uint8)))
     black = np.zeros(3, np.float32)
     same = splat_photos(photos, np.zeros((6, 3)), splats_from_scene=IDENTITY, near=0.0)
     found = splat_photos(taken, gains, splats_from_scene=IDENTITY, near=0.0)
@@ -125,12 +120,8 @@ def test_masked_pixels_have_no_say() -> None:
     used[:, 32:] = False
     hidden = [replace(p, pixels=np.where(used[..., None], p.pixels, 255).astype(np.uint8), used=used) for p in photos]
     state = Refinement.of(rows_of(wall()))
-    refine(
-        state,
-        splat_photos(hidden, np.zeros((6, 3)), splats_from_scene=IDENTITY, near=0.0),
-        background=(0,) * 3,
-        steps=30,
-    )
+    targets = splat_photos(hidden, np.zeros((6, 3)), splats_from_scene=IDENTITY, near=0.0)
+    refine(state, targets, background=(0,) * 3, steps=30)
     shown = SplatScene(gaussians_of(state.rows)).render(frames()[2]).rgb
     assert np.abs(shown - photos[2].pixels / 255).mean() < 0.01
 
@@ -141,16 +132,12 @@ def test_frames_and_depth_of_a_scene() -> None:
     along = scene.render(frame, depth=DepthRequest("conditional", "ray"))
     z = scene.render(frame, depth=DepthRequest("conditional", "z"))
     cosines = frame.camera.pixel_bearings()[0][:, 2].reshape(48, 64)
-    assert along.depth is not None
-    assert z.depth is not None
-    np.testing.assert_allclose(z.depth, along.depth * cosines, rtol=1e-5)
-    median = scene.render(frame, depth=DepthRequest("median", "z")).depth
-    assert median is not None
+    np.testing.assert_allclose(present(z.depth), present(along.depth) * cosines, rtol=1e-5)
+    median = present(scene.render(frame, depth=DepthRequest("median", "z")).depth)
     assert 2.7 < np.nanmin(median) < np.nanmax(median) < 3.4
     moved = Similarity(2.0, np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.array([1.0, 2, 3]))
-    there = SplatScene(wall().moved(moved)).render(
-        replace(frame, world_from_cam=moved.apply_pose(frame.world_from_cam))
-    )
+    elsewhere = replace(frame, world_from_cam=moved.apply_pose(frame.world_from_cam))
+    there = SplatScene(wall().moved(moved)).render(elsewhere)
     np.testing.assert_allclose(there.rgb, along.rgb, atol=2e-3)
 
 
@@ -234,14 +221,9 @@ def test_an_interrupt_saves_the_splats_and_writes_no_file(run: Path, monkeypatch
 
     monkeypatch.setattr(refinement, "step_splats", interrupted)
     target, notes = run.with_name("interrupted.ply"), []
+    long, reporter = replace(SMALL, budget_seconds=60), Reporter(note=notes.append)
     with pytest.raises(KeyboardInterrupt):
-        nerfcli.export_run(
-            run,
-            Output(target),
-            to="splats",
-            splats=replace(SMALL, budget_seconds=60),
-            reporter=Reporter(note=notes.append),
-        )
+        nerfcli.export_run(run, Output(target), to="splats", splats=long, reporter=reporter)
     assert not target.exists()
     assert load_splat_state(run / SPLATS).refinement.steps == 3
     assert notes[-1] == "the splats are saved; to continue, add --resume to the same command"
@@ -299,9 +281,8 @@ def test_splats_of_a_run_in_a_read_only_folder_are_exported(run: Path, monkeypat
     monkeypatch.setattr("nerfcli.workflows.splats.save_splats", refuse)
     notes: list[str] = []
     other = replace(SMALL, count=700, budget_seconds=0.2)
-    nerfcli.export_run(
-        run, Output(run.with_name("r.ply")), to="splats", splats=other, reporter=Reporter(note=notes.append)
-    )
+    reporter = Reporter(note=notes.append)
+    nerfcli.export_run(run, Output(run.with_name("r.ply")), to="splats", splats=other, reporter=reporter)
     assert f"the splats could not be saved in the run: cannot write {run / SPLATS}: Read-only file system" in notes
     assert len(nerfcli.load_splats(run.with_name("r.ply")).gaussians) <= 700
 
@@ -311,15 +292,13 @@ def test_splats_are_measured_by_the_protocol_of_fields(run: Path) -> None:
     ply = run.with_name("spheres-run-splats.ply")
     found = evaluate_splats(run, ply)
     name = found.metrics.images[0].name
-    folder = nerfcli.render_run(
-        run, splats=ply, settings=RenderSettings(("rgb",), DepthRequest("median", "z"), rgba=False)
-    )
+    settings = RenderSettings(("rgb",), DepthRequest("median", "z"), rgba=False)
+    folder = nerfcli.render_run(run, splats=ply, settings=settings)
     assert folder[0].parent.name == "test-splats"
     shown = read_image(next(folder[0].rglob(f"{Path(name).stem}.png")))
     assert shown.shape[:2] == (72, 96)
     assert found.metrics.protocol.startswith("nerfcli-2")
-    assert found.metrics.splats is not None
-    assert found.metrics.splats["count"] == len(nerfcli.load_splats(ply).gaussians)
+    assert present(found.metrics.splats)["count"] == len(nerfcli.load_splats(ply).gaussians)
     assert evaluate_splats(run, ply).is_kept
 
 

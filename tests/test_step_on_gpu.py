@@ -67,17 +67,13 @@ class Waits(TorchDispatchMode):
             if here:
                 assert first is not None
                 dtype = kwargs.get("dtype") or first.dtype
-                is_poses = first.shape[-2:] == (4, 4)
-                return (
-                    torch.eye(4, dtype=dtype).expand(first.shape)
-                    if is_poses
-                    else torch.full(first.shape, ANY, dtype=dtype)
-                )
+                if first.shape[-2:] == (4, 4):  # poses
+                    return torch.eye(4, dtype=dtype).expand(first.shape)
+                return torch.full(first.shape, ANY, dtype=dtype)
         if name == "copy_" and args[0].device != args[1].device and not (len(args) > 2 and args[2]):
             self.note()
-        masks = (
-            [part for part in args[1] or () if part is not None] if name in ("index", "index_put_", "index_put") else []
-        )
+        indices = args[1] or () if name in ("index", "index_put_", "index_put") else ()
+        masks = [part for part in indices if part is not None]
         if here and (name in SIZED_BY_NUMBERS or any(mask.dtype in (torch.bool, torch.uint8) for mask in masks)):
             self.note()
             raise AssertionError(f"{name} makes the host wait: {self.lines[-1]}")

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
+from present import present
 
 pytest.importorskip("triton", reason="Triton is for Linux")
 
@@ -34,6 +35,7 @@ HERE = Path(__file__).parent
 # The first replaces parts of Triton's interpreter by faster ones, for both.
 SUITE = (sys.executable, "-m", "pytest", "-p", "no:cacheprovider", HERE / "triton_kernels.py", HERE / "test_kernels.py")
 CUOBJDUMP, NVDISASM = (Path(nvidia.__file__).parent / "bin" / name for name in ("cuobjdump", "nvdisasm"))
+CPU = torch.device("cpu")
 # Shared memory of an Ampere, Ada or Blackwell desktop card, in bytes per program.
 MOST_SHARED = 99 * 1024
 
@@ -46,28 +48,23 @@ class Interpreted(NamedTuple):
     variants: list[Variant]
 
 
+def run_suite(*options: str, **variables: str) -> "subprocess.CompletedProcess[str]":
+    environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
+    environment |= {"NERFCLI_KERNELS": "triton_cuda", **variables}
+    command = [*map(str, SUITE), *options]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, cwd=HERE.parent)
+
+
 @pytest.fixture(scope="module")
 def interpreted(tmp_path_factory: pytest.TempPathFactory) -> Interpreted:
     path = tmp_path_factory.mktemp("triton") / "variants.json"
-    done = subprocess.run(
-        [*SUITE, "-x"],
-        env={**os.environ, "NERFCLI_KERNELS": "triton_cuda", "TRITON_INTERPRET": "1", "NERFCLI_VARIANTS": str(path)},
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=HERE.parent,
-    )
+    done = run_suite("-x", TRITON_INTERPRET="1", NERFCLI_VARIANTS=str(path))
     listed = json.loads(path.read_text()) if path.is_file() else []
     variants = [
         Variant(
-            getattr(import_module(module), name),
-            tuple(types),
-            tuple(aligned),
-            tuple((key, value) for key, value in constants),
-            warps,
-            stages,
+            getattr(import_module(module), name), tuple(types), tuple(aligned), tuple(map(tuple, constants)), *options
         )
-        for module, name, types, aligned, constants, warps, stages in listed
+        for module, name, types, aligned, constants, *options in listed
     ]
     return Interpreted(done.returncode, done.stdout + done.stderr, variants)
 
@@ -124,10 +121,8 @@ def test_kernels_agree_with_the_reference_on_a_gpu():
     """Run twice, as a race between two programs may give the right result by chance."""
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
-    plain = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
-    plain["NERFCLI_KERNELS"] = "triton_cuda"
     for _ in range(2):
-        done = subprocess.run(SUITE, env=plain, capture_output=True, text=True, check=False, cwd=HERE.parent)
+        done = run_suite()
         assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -226,22 +221,16 @@ class FakeDriver:
         assert params is None
         assert (extra[0], extra[2], extra[4]) == (1, 2, None)
         size = ctypes.c_size_t.from_address(extra[3]).value
-        self.launches.append(
-            {
-                "grid": (x, y, z),
-                "threads": (threads, ty, tz),
-                "shared": shared,
-                "stream": stream.value,
-                "buffer": ctypes.string_at(extra[1], size),
-            }
-        )
+        seen = {"grid": (x, y, z), "threads": (threads, ty, tz), "shared": shared, "stream": stream.value}
+        self.launches.append({**seen, "buffer": ctypes.string_at(extra[1], size)})
 
 
 @pytest.fixture
-def device(monkeypatch: pytest.MonkeyPatch) -> Callable[[FakeDriver], torch.device]:
+def install(monkeypatch: pytest.MonkeyPatch) -> Callable[..., FakeDriver]:
     """Make torch report a GPU and replace the driver by a fake; tensors are on the CPU."""
 
-    def install(fake: FakeDriver, capability: tuple[int, int] = (9, 0)) -> torch.device:
+    def install(failing: str = "", error: int = 0, *, capability: tuple[int, int] = (9, 0)) -> FakeDriver:
+        fake = FakeDriver(failing, error)
         monkeypatch.setattr(driver, "library", lambda: fake)
         monkeypatch.setattr(driver, "_of_thread", threading.local())
         monkeypatch.setattr(launch, "_loaded", {})
@@ -251,14 +240,13 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Callable[[FakeDriver], torch.devi
         monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device=None: capability)
         monkeypatch.setattr(torch.Tensor, "get_device", lambda tensor: 1)
         monkeypatch.setattr(launch, "_stream", lambda device: 4711)
-        return torch.device("cpu")
+        return fake
 
     return install
 
 
-def test_a_launch_gives_the_driver_what_the_kernel_expects(device, kernel_cache):
-    fake = FakeDriver()
-    device(fake)
+def test_a_launch_gives_the_driver_what_the_kernel_expects(install, kernel_cache):
+    fake = install()
     out = torch.zeros(100)
     for _ in range(2):
         launch.launch(launch._count, (3, 2), out, 7, 0.5, 90, BLOCK=32)
@@ -272,9 +260,8 @@ def test_a_launch_gives_the_driver_what_the_kernel_expects(device, kernel_cache)
     assert fake.calls == [*once, "cuLaunchKernel", "cuLaunchKernel"]
 
 
-def test_large_shared_memory_is_requested(device):
-    fake = FakeDriver()
-    device(fake)
+def test_large_shared_memory_is_requested(install):
+    fake = install()
     built = Cubin("kernel", b"code", "", "Q", 8, 60_000)
     driver.load(built, 0).launch((5,), [12], 0)
     assert "cuFuncSetAttribute" in fake.calls
@@ -282,16 +269,14 @@ def test_large_shared_memory_is_requested(device):
     assert fake.launches[0]["threads"] == (256, 1, 1)
 
 
-def test_nothing_is_launched_for_nothing(device):
-    fake = FakeDriver()
-    device(fake)
+def test_nothing_is_launched_for_nothing(install):
+    fake = install()
     launch.launch(launch._count, (0,), torch.zeros(0), 7, 0.5, 0, BLOCK=32)
     assert fake.calls == []
 
 
-def test_what_is_not_aligned_is_compiled_for_that(device, monkeypatch):
-    fake = FakeDriver()
-    device(fake)
+def test_what_is_not_aligned_is_compiled_for_that(install, monkeypatch):
+    install()
     variants = []
     monkeypatch.setattr(launch, "_load", lambda variant, device: variants.append((variant.aligned, device)))
     for tensor in (torch.zeros(8), torch.zeros(9)[1:]):
@@ -300,59 +285,62 @@ def test_what_is_not_aligned_is_compiled_for_that(device, monkeypatch):
     assert variants == [((0,), 1), ((), 1)]
 
 
-def test_an_error_of_the_driver_is_named(device, kernel_cache):
-    device(FakeDriver("cuLaunchKernel", 701))
+def test_an_error_of_the_driver_is_named(install, kernel_cache):
+    install("cuLaunchKernel", 701)
     with pytest.raises(driver.DriverError, match="cuLaunchKernel returned error 701"):
         launch.launch(launch._count, (1,), torch.zeros(4), 7, 0.5, 4, BLOCK=32)
 
 
-def test_old_devices_are_refused(device):
-    here = device(FakeDriver(), (7, 5))
-    assert launch.choose_launcher(here) == "it has compute capability 7.5, and 8.0 or newer is needed"
+def test_old_devices_are_refused(install):
+    install(capability=(7, 5))
+    assert launch.choose_launcher(CPU) == "it has compute capability 7.5, and 8.0 or newer is needed"
 
 
-def test_an_old_triton_is_refused(device, monkeypatch):
-    here = device(FakeDriver())
+def test_an_old_triton_is_refused(install, monkeypatch):
+    install()
     monkeypatch.setattr(triton, "__version__", "3.5.1")
-    assert launch.choose_launcher(here) == "Triton 3.5.1 is too old, 3.6 or newer is needed"
+    assert launch.choose_launcher(CPU) == "Triton 3.5.1 is too old, 3.6 or newer is needed"
 
 
-def test_each_device_has_its_own_launcher(device, kernel_cache, monkeypatch):
+def test_each_device_has_its_own_launcher(install, kernel_cache, monkeypatch):
     """A device on which no launcher works does not affect the others."""
-    here = device(FakeDriver())
+    install()
     monkeypatch.setattr(launch, "_counts", lambda device: torch.cuda.current_device() == 1)
-    assert launch.choose_launcher(here) is None
+    assert launch.choose_launcher(CPU) is None
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 2)
-    assert launch.choose_launcher(here) is not None
+    assert launch.choose_launcher(CPU) is not None
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
-    assert launch.launcher(here) == "CUDA driver"
+    assert launch.launcher(CPU) == "CUDA driver"
 
 
-def test_a_device_on_which_neither_way_works_is_refused_with_both_reasons(device, kernel_cache, monkeypatch):
+def test_a_device_on_which_neither_way_works_is_refused_with_both_reasons(install, kernel_cache, monkeypatch):
     """Here the fake driver computes nothing, and Triton's launcher finds no driver."""
-    here = device(FakeDriver())
-    reason = launch.choose_launcher(here)
-    assert reason is not None
+    install()
+    reason = present(launch.choose_launcher(CPU))
     assert re.match(r"kernels cannot be launched by the driver \(wrong numbers\), nor by Triton \(.*", reason)
-    here = device(FakeDriver("cuModuleLoadData", 200))
-    assert "DriverError: cuModuleLoadData returned error 200" in str(launch.choose_launcher(here))
+    install("cuModuleLoadData", 200)
+    assert "DriverError: cuModuleLoadData returned error 200" in str(launch.choose_launcher(CPU))
 
 
-def test_triton_launches_where_the_driver_cannot(device, kernel_cache, monkeypatch):
-    here = device(FakeDriver("cuLaunchKernel", 1))
+def test_triton_launches_where_the_driver_cannot(install, kernel_cache, monkeypatch):
+    install("cuLaunchKernel", 1)
 
     def counts(self, *arguments, grid, warmup, **named):
         out, first, step, count = arguments
         out[:count] = first + step * torch.arange(count)
 
     monkeypatch.setattr(JITFunction, "run", counts)
-    assert launch.choose_launcher(here) is None
-    assert launch.launcher(here) == "Triton"
+    assert launch.choose_launcher(CPU) is None
+    assert launch.launcher(CPU) == "Triton"
+
+
+def counting() -> Variant:
+    return launch.variant_of(launch._count, (torch.zeros(4), 7, 0.5, 4), {"BLOCK": 32}, warps=4, stages=1)
 
 
 def test_machine_code_is_kept_on_disk_and_damage_is_noticed(monkeypatch, tmp_path):
     monkeypatch.setenv("NERFCLI_KERNEL_CACHE", str(tmp_path))
-    variant = launch.variant_of(launch._count, (torch.zeros(4), 7, 0.5, 4), {"BLOCK": 32}, warps=4, stages=1)
+    variant = counting()
     first = compiled(variant, 90)
     (path,) = tmp_path.glob("*.cubin")
     monkeypatch.setattr(cubin, "compile_now", None)
@@ -373,7 +361,7 @@ def test_a_change_of_a_constant_of_the_reference_outdates_the_machine_code(monke
     constants = tmp_path / "reference" / "compositing.py"
     constants.parent.mkdir()
     constants.write_text("MOST_DEVIATION = 0.25\n")
-    compiled(launch.variant_of(launch._count, (torch.zeros(4), 7, 0.5, 4), {"BLOCK": 32}, warps=4, stages=1), 90)
+    compiled(counting(), 90)
     assert cubin.is_compiled()
     constants.write_text("MOST_DEVIATION = 0.5\n")
     assert not cubin.is_compiled()
@@ -391,7 +379,7 @@ def test_the_cache_is_bounded_and_what_was_used_least_recently_goes_first(monkey
         os.utime(path, (1000 - age, 1000 - age))
     (tmp_path / ".new.partial-7.cubin").write_bytes(b"x" * 10_000)
     (tmp_path / "gone.cubin").symlink_to("nowhere")  # as if another process had removed it meanwhile
-    variant = launch.variant_of(launch._count, (torch.zeros(4), 7, 0.5, 4), {"BLOCK": 32}, warps=4, stages=1)
+    variant = counting()
     assert not cubin.is_compiled()
     assert compiled(variant, 90) == compiled(variant, 90) == built
     assert cubin.is_compiled()

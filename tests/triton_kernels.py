@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from present import present
+from test_backends import COMPILED, CPU, field_of, learned, rays_and_march
 from test_kernels import DEVICE, RELATIVE, SIZES, assert_close, points_and_table
 from torch import Tensor
 from triton.language import core
@@ -26,18 +28,9 @@ from triton.language.semantic import TritonSemantic
 from triton.runtime import interpreter
 
 from nerfcli import kernels
-from nerfcli.kernels import (
-    AdamStep,
-    Backend,
-    HashGrid,
-    March,
-    Rays,
-    Targets,
-    TraceOptions,
-    reference,
-    spherical_harmonics,
-)
+from nerfcli.kernels import AdamStep, Backend, HashGrid, March, Rays, Targets, TraceOptions, reference
 from nerfcli.kernels.contraction import contract
+from nerfcli.kernels.interface import Samples
 from nerfcli.kernels.selftest.measure import MET, Precision
 from nerfcli.kernels.selftest.table import OF_GPU, checks, row_of
 from nerfcli.kernels.triton_cuda import compositing, hash_grid, launch, marching, networks
@@ -64,11 +57,8 @@ def _interpreted_fast() -> Iterator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         replace_all, dtype_of = interpreter._patch_builtin, interpreter._get_np_dtype
-        broadcast, new_tensor, new_type = (
-            TritonSemantic.broadcast_impl_value,
-            core.tensor.__init__,
-            core.block_type.__init__,
-        )
+        new_tensor, new_type = core.tensor.__init__, core.block_type.__init__
+        broadcast = TritonSemantic.broadcast_impl_value
         builder, dtypes = interpreter.interpreter_builder, dict[str, Any]()
         types, shapes = dict[Any, dict[str, Any]](), dict[str, tuple[Any, Any]]()
 
@@ -147,7 +137,7 @@ def test_networks(samples, hidden, degree, generator):
     by_density, by_rgb = by_density * 1e-7, by_rgb * 1e-6  # as of a mean over many rays
     inputs = [x.double().requires_grad_() for x in (code, directions[rays], *layers)]
     each = torch.arange(samples)
-    exact = reference.radiance(inputs[0], spherical_harmonics(inputs[1], degree), each, tuple(inputs[2:]))
+    exact = reference.radiance(inputs[0], kernels.spherical_harmonics(inputs[1], degree), each, tuple(inputs[2:]))
     ((exact[0] * by_density).sum() + (exact[1] * by_rgb).sum()).backward()
     given = on_device(code, directions, rays)
     weights = on_device(*layers)
@@ -194,41 +184,37 @@ def test_densities_end_where_their_logarithms_do():
     torch.testing.assert_close(found, wanted, rtol=1e-5, atol=0, equal_nan=True)
 
 
-def rays_and_march(count: int, contraction: str, generator: torch.Generator) -> tuple[Rays, March]:
-    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
-    origins = -1.5 * directions + 0.3 * torch.randn(count, 3, generator=generator)
-    jitter, cones = torch.rand(count, generator=generator), 0.05 * torch.rand(count, generator=generator)
-    occupied = torch.rand(8, 8, 8, generator=generator) > 0.4
-    edges = torch.linspace(0.55, 2.0, 44).square()
-    return Rays(*on_device(origins, directions, jitter, cones)), March(*on_device(edges, occupied), contraction, 7.0)
-
-
 def exactly(rays: Rays, march: March) -> tuple[Rays, March]:
     """Return the same rays and march in float64 on the CPU."""
     plain = Rays(*(None if x is None else x.detach().cpu().double() for x in rays))  # type: ignore[arg-type]
     return plain, march._replace(edges=march.edges.cpu().double(), occupied=march.occupied.cpu())
 
 
+def random_grid(rows: int, contrast: float, generator: torch.Generator, *, antialias: bool = False) -> HashGrid:
+    table = (contrast * torch.randn(8, rows, 4, generator=generator)).half().float()
+    return HashGrid(table, tuple(range(4, 12)), tuple(layers_of(32, generator)), antialias=antialias)
+
+
+def in_double(grid: HashGrid) -> HashGrid:
+    return grid._replace(table=grid.table.double(), layers=tuple(x.double() for x in grid.layers))
+
+
+def seen_on_device(rays: Rays, march: March, grid: HashGrid, **options: Any) -> Samples:
+    """Return the samples by the GPU kernel, from half of the table's precision."""
+    options = {"capacity": marching.Capacity(), **options}
+    table = grid.table.half().to(DEVICE)
+    return marching.visible_samples(rays, march, grid._replace(layers=on_device(*grid.layers)), table=table, **options)
+
+
 @pytest.mark.parametrize(("count", "room", "faded"), [(0, 0, False), (1, 0, True), (5, 1, True), (60, 2000, False)])
 def test_visible_samples(count, room, faded, generator):
     """With no, too little and too much room for candidates."""
-    rays, march = rays_and_march(count, "l2", generator)
-    table = (0.7 * torch.randn(8, 64, 4, generator=generator)).half().float()
-    layers = tuple(layers_of(32, generator))
-    march = march._replace(max_optical_depth=1.0)
-    grid = HashGrid(table, (4, 5, 6, 7, 8, 9, 10, 11), layers, antialias=faded)
-    exact = reference.visible_samples(
-        *exactly(rays, march), grid._replace(table=table.double(), layers=tuple(x.double() for x in layers))
-    )
-    capacity = marching.Capacity(room)
-    fast = marching.visible_samples(
-        rays, march, grid._replace(layers=on_device(*layers)), table=table.half().to(DEVICE), capacity=capacity
-    )
+    rays, march = rays_and_march(count, torch.float32, DEVICE)
+    march, grid = march._replace(max_optical_depth=1.0), random_grid(64, 0.7, generator, antialias=faded)
+    exact = reference.visible_samples(*exactly(rays, march), in_double(grid))
+    fast = seen_on_device(rays, march, grid, capacity=marching.Capacity(room))
     assert torch.equal(fast.offsets.cpu(), exact.offsets)  # for these seeds both keep the same samples
-    assert fast.rays is not None
-    assert torch.equal(fast.rays.cpu(), reference.ray_indices(exact.offsets))
-    assert exact.encoded is not None
-    assert fast.encoded is not None
+    assert torch.equal(present(fast.rays).cpu(), reference.ray_indices(exact.offsets))
     for name, relative in (("starts", SINGLE), ("ends", SINGLE), ("coordinates", SINGLE), ("encoded", HALF)):
         assert_close(getattr(fast, name).float(), getattr(exact, name), name, relative=relative)
     assert_close(fast.density, exact.density, "density", relative=HALF)
@@ -237,19 +223,12 @@ def test_visible_samples(count, room, faded, generator):
 @pytest.mark.parametrize(("least", "fraction"), [(0.0, 1.0), (0.02, 0.9), (0.08, 0.6), (2.0, 1.0)])
 def test_faint_samples_are_left_out_but_counted_for_visits_and_never_all(least, fraction, generator):
     """With 0, none is left out; with 0.02, a tenth or more; with 0.08, 40 %; with 2, all are kept."""
-    rays, march = rays_and_march(60, "l2", generator)
-    table = (0.7 * torch.randn(8, 64, 4, generator=generator)).half().float()
-    layers = tuple(layers_of(32, generator))
-    march = march._replace(max_optical_depth=3.0, least_weight=least)
-    grid = HashGrid(table, (4, 5, 6, 7, 8, 9, 10, 11), layers)
-    doubled = grid._replace(table=table.double(), layers=tuple(x.double() for x in layers))
+    rays, march = rays_and_march(60, torch.float32, DEVICE)
+    march, grid = march._replace(max_optical_depth=3.0, least_weight=least), random_grid(64, 0.7, generator)
     expected_visits, cell_depths = torch.zeros(8, 8, 8, dtype=torch.float64), torch.zeros(8, 8, 8, device=DEVICE)
-    exact = reference.visible_samples(*exactly(rays, march), doubled, expected_visits)
-    fast = marching.visible_samples(
-        rays, march, grid._replace(layers=on_device(*layers)), table=table.half().to(DEVICE),
-        capacity=marching.Capacity(), cell_depths=cell_depths,
-    )  # fmt: skip
-    every = reference.visible_samples(*exactly(rays, march._replace(least_weight=0.0)), doubled)
+    exact = reference.visible_samples(*exactly(rays, march), in_double(grid), expected_visits)
+    fast = seen_on_device(rays, march, grid, cell_depths=cell_depths)
+    every = reference.visible_samples(*exactly(rays, march._replace(least_weight=0.0)), in_double(grid))
     assert len(exact.starts) <= fraction * len(every.starts)
     assert torch.equal(fast.offsets.cpu(), exact.offsets)  # for this seed both keep the same samples
     assert_close(fast.starts, exact.starts, "starts")
@@ -259,14 +238,11 @@ def test_faint_samples_are_left_out_but_counted_for_visits_and_never_all(least, 
 
 
 def test_visits_leave_out_densities_that_are_not_a_number(generator):
-    rays, march = rays_and_march(60, "l2", generator)
-    table = 0.7 * torch.randn(8, 64, 4, generator=generator)
-    table[0, ::16] = torch.nan
-    grid = HashGrid(table, (4, 5, 6, 7, 8, 9, 10, 11), on_device(*layers_of(32, generator)))
+    rays, march = rays_and_march(60, torch.float32, DEVICE)
+    grid = random_grid(64, 0.7, generator)
+    grid.table[0, ::16] = torch.nan
     cell_depths = torch.full((8, 8, 8), -1.0, device=DEVICE)
-    seen = marching.visible_samples(
-        rays, march, grid, table=table.half().to(DEVICE), capacity=marching.Capacity(), cell_depths=cell_depths
-    )
+    seen = seen_on_device(rays, march, grid, cell_depths=cell_depths)
     assert seen.density.isnan().any()
     assert not cell_depths.isnan().any()
     assert (cell_depths >= 0).any()
@@ -283,40 +259,13 @@ def test_contracted_distances(samples, generator):
         assert_close(contracted, reference.contracted_distance(distances.double()), "contracted distances")
 
 
-def whole(
-    backend: Backend, dtype: torch.dtype, count: int, *, hidden: int, targets: Targets, with_sink: bool
-) -> dict[str, Tensor]:
-    """Return the outputs of a training step for some rays, and the gradients of a randomly weighted sum of them."""
-    g = torch.Generator().manual_seed(3)
-    device = DEVICE if dtype == torch.float32 else torch.device("cpu")
-    rays, march = rays_and_march(count, "l2", g)
-    if dtype == torch.float64:
-        rays, march = exactly(rays, march)
-    rays = rays._replace(origins=rays.origins.requires_grad_(), directions=rays.directions.requires_grad_())
-    table = (0.5 * torch.randn(8, 256, 4, generator=g)).half().to(device, dtype).requires_grad_()
-    layers = tuple(x.to(device, dtype).requires_grad_() for x in layers_of(hidden, g))
-    resolutions = tuple(round(4 * 1.22**level) for level in range(8))
-    background = torch.rand(count, 3, generator=g).to(device, dtype)
-    targets = targets._replace(distances=(0.7 + torch.rand(count // 2, generator=g)).to(device, dtype))
-    table_grad = torch.zeros_like(table, requires_grad=False) if with_sink else None
-    grid = HashGrid(table, resolutions, layers, 3, with_sink, table_grad)
-    seen = backend.render_rays(rays, march, grid, targets, background=background)
-    total = sum((x * torch.randn(x.shape, generator=g).to(device, dtype)).sum() for x in seen[:4])
-    assert isinstance(total, Tensor)
-    total.backward()
-    gradients = {"by origins": rays.origins.grad, "by directions": rays.directions.grad}
-    gradients |= {f"by layer {i}": layer.grad for i, layer in enumerate(layers)}
-    gradients["by table"] = table.grad if table_grad is None else table_grad
-    assert (table.grad is None) == with_sink
-    return {**seen._asdict(), **{name: value for name, value in gradients.items() if value is not None}}
-
-
 @pytest.mark.parametrize(("count", "with_sink"), [(0, False), (1, True), (5, False), (23, True)])
 def test_a_training_gets_what_the_reference_gives_in_float64(count, with_sink):
     """Colours, distortion and gradients of rays, layers and rows, with and without a sink and fading levels."""
-    given = {"hidden": 64 if with_sink else 32, "targets": Targets(1.0, True), "with_sink": with_sink}
-    exact = whole(kernels.backend_for(torch.device("cpu"), torch.float64), torch.float64, count, **given)
-    fast = whole(TritonBackend(DEVICE), torch.float32, count, **given)
+    settings = replace(COMPILED, width=64 if with_sink else 32, antialias=with_sink)
+    given = {"targets": Targets(1.0, True, torch.linspace(0.7, 1.7, 11)[: count // 2]), "with_sink": with_sink}
+    exact = learned(field_of(settings, Backend(CPU), torch.float64), count, **given)
+    fast = learned(field_of(settings, TritonBackend(DEVICE), torch.float32, DEVICE), count, **given)
     assert int(fast["samples"]) == int(exact["samples"])
     assert fast.keys() == exact.keys()
     for name, value in fast.items():
@@ -325,23 +274,12 @@ def test_a_training_gets_what_the_reference_gives_in_float64(count, with_sink):
 
 
 def test_a_picture_is_what_the_reference_gives_in_float64(generator):
-    rays, march = rays_and_march(23, "l2", generator)
-    table = (0.5 * torch.randn(8, 256, 4, generator=generator)).half().float()
-    layers = layers_of(32, generator)
-    resolutions = tuple(round(4 * 1.22**level) for level in range(8))
-    background = torch.tensor([0.25, 0.5, 1.0])
+    rays, march = rays_and_march(23, torch.float32, DEVICE)
+    grid, background = random_grid(256, 0.5, generator), torch.tensor([0.25, 0.5, 1.0])
     options = TraceOptions((0.25, 0.5), 0.3)
-    fast = TritonBackend(DEVICE).trace_rays(
-        rays,
-        march,
-        HashGrid(table.to(DEVICE), resolutions, on_device(*layers)),
-        options,
-        background=background.to(DEVICE),
-    )
-    exact = kernels.backend_for(torch.device("cpu"), torch.float64).trace_rays(
-        *exactly(rays, march), HashGrid(table.double(), resolutions, tuple(x.double() for x in layers)),
-        options, background=background.double(),
-    )  # fmt: skip
+    here = grid._replace(table=grid.table.to(DEVICE), layers=on_device(*grid.layers))
+    fast = TritonBackend(DEVICE).trace_rays(rays, march, here, options, background=background.to(DEVICE))
+    exact = Backend(CPU).trace_rays(*exactly(rays, march), in_double(grid), options, background=background.double())
     assert torch.equal(fast.intervals.offsets.cpu(), exact.intervals.offsets)
     assert_close(fast.rgb, exact.rgb, "rgb", relative=HALF)
     assert_close(fast.truncation_error, exact.truncation_error, "error", relative=HALF)
