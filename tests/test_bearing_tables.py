@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from frame_rays import frame_rays
+from present import present
 from test_training_rays import BARREL, CPU, FISHEYE, SIMILARITY, numbered_photo, ring
 
 from nerfcli.cameras.camera import Camera, by_lens
@@ -53,8 +54,7 @@ def test_photos_of_other_lenses_keep_their_bits():
 def test_photos_share_one_table_of_their_lens():
     tables = BearingTables(stabilised(LENS), CPU, storage=IN_MEMORY)
     assert len(tables.values) == (160 + 7 + 1) * (120 + 9 + 1)
-    assert tables.grids is not None
-    assert (tables.grids.widths == torch.tensor([160, 168])).all()
+    assert (present(tables.grids).widths == torch.tensor([160, 168])).all()
     same = BearingTables([LENS, LENS], CPU, storage=IN_MEMORY)
     assert len(same.values) == 160 * 120
     assert same.grids is None
@@ -100,20 +100,17 @@ def test_the_memory_of_stabilised_photos_counts_their_bearings_once():
 def test_trials_need_a_list_of_pixels_and_occluders_another_one():
     """Eight bytes of a number and one of a mask; two masks for occluders, which users may turn off."""
     chosen = TrainSettings(budget_seconds=None, steps=7)
-    photos = [
-        needs_of(ring(), 1, settings=settings).photos
-        for settings in (chosen, replace(chosen, model="auto", fixed=("occluders",)), replace(chosen, model="auto"))
-    ]
+    trials = replace(chosen, model="auto")
+    several = (chosen, replace(trials, fixed=("occluders",)), trials)
+    photos = [needs_of(ring(), 1, settings=settings).photos for settings in several]
     pixels = sum(frame.camera.width * frame.camera.height for frame in ring())
     assert np.diff(photos).tolist() == [9 * pixels, 10 * pixels]
 
 
 def test_a_step_of_a_network_needs_its_neurons():
     """Of each sample all activations and their gradients, float32: a layer has 1 / 3.5 of the weights."""
-    small, large = (
-        needs_of(ring(), 1, settings=TrainSettings(field="mlp", field_memory_bytes=size)).step
-        for size in (2**18, 2**26)
-    )
+    sizes = [TrainSettings(field="mlp", field_memory_bytes=size) for size in (2**18, 2**26)]
+    small, large = (needs_of(ring(), 1, settings=size).step for size in sizes)
     width = (2**26 / 4 / 3.5) ** 0.5
     more = 7 * (2**26 - 2**18) + TrainSettings().samples[1] * 4 * 2 * 4 * width * (1 - 1 / 16)
     assert large - small == pytest.approx(more, rel=0.1)

@@ -16,11 +16,12 @@ import tifffile
 import torch
 from every_format import Views, write_polycam, write_record3d
 from PIL import Image
+from present import present
 from test_stereo import OFFSETS, photo, truth
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame, SensorDepth
-from nerfcli.cameras.rigid import Similarity
+from nerfcli.cameras.rigid import Similarity, from_parts
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.polycam import parse_polycam
 from nerfcli.captures.formats.pose_files import parse_pose_files
@@ -28,6 +29,8 @@ from nerfcli.captures.formats.record3d import parse_record3d
 from nerfcli.captures.formats.registry import depths_beside
 from nerfcli.captures.formats.scene_folder import parse_scene, write_scene
 from nerfcli.captures.formats.transforms import losses_transforms, parse_transforms, write_transforms
+from nerfcli.cli.options import Training
+from nerfcli.cli.train import Fit
 from nerfcli.errors import UserError
 from nerfcli.matching.stereo import DenseDepth
 from nerfcli.photos.loading import LoadedPhoto
@@ -61,8 +64,7 @@ def place(folder: Path, maps: Sequence[np.ndarray], *, unit: float = 1e-3) -> Pi
         image, depth = folder / f"{index}.png", folder / f"{index}.depth.png"
         cv2.imwrite(str(image), np.full((120, 160, 3), 128, np.uint8))
         cv2.imwrite(str(depth), levels)
-        pose = np.eye(4)
-        pose[0, 3] = 0.1 * index / METRES
+        pose = from_parts(np.eye(3), np.array([0.1 * index / METRES, 0.0, 0.0]))
         frame = Frame(image.name, PHOTO, pose, image=image, depth=SensorDepth(depth, unit))
         photos.append(LoadedPhoto(frame, np.full((120, 160, 3), 128, np.uint8), None))
     return PixelPool(photos, TRAINING, torch.device("cpu"))
@@ -70,6 +72,11 @@ def place(folder: Path, maps: Sequence[np.ndarray], *, unit: float = 1e-3) -> Pi
 
 def levels_of(z: np.ndarray, unit: float = 1e-3) -> np.ndarray:
     return np.rint(z / unit).astype(np.uint16)
+
+
+def place_panel(folder: Path, count: int = 4, *, unit: float = 1e-3) -> PixelPool:
+    """Place photos of the panel, with maps of half their size in levels of `unit`, which is stated as 1e-3."""
+    return place(folder, [levels_of(z_of(MAP, 0.1 * index), unit) for index in range(count)])
 
 
 def known_points(pool: PixelPool, *, seed: int = 0, count: int = 400) -> PointDepths:
@@ -93,26 +100,23 @@ def measured(pool: PixelPool, said: list[str] | None = None, *, count: int = 400
 
 def errors(depths: Sequence[DenseDepth]) -> np.ndarray:
     """Return relative errors against the truth."""
-    return np.concatenate(
-        [depth.distances / true_distances(depth.pixels, index) - 1.0 for index, depth in enumerate(depths)]
-    )
+    numbered = enumerate(depths)
+    return np.concatenate([depth.distances / true_distances(depth.pixels, index) - 1.0 for index, depth in numbered])
 
 
 @pytest.mark.parametrize("unit", [1e-3, 2e-4])
 def test_depths_in_another_unit_and_size_are_distances_along_the_rays(tmp_path, unit):
     """Maps have half the photos' size. The unit is a millimetre, as stated, or a fifth of what is stated."""
     said: list[str] = []
-    pool = place(tmp_path, [levels_of(z_of(MAP, 0.1 * i), unit) for i in range(4)])
+    pool = place_panel(tmp_path, unit=unit)
     found = measured(pool, said)
     # Half a pixel of the map, on a wall whose depth changes by 0.35 % from pixel to pixel, and half a level.
     assert np.abs(errors(found)).max() < 5e-3
     assert all(len(depth.pixels) > 0.8 * 80 * 60 for depth in found)
     assert f"{unit / 1e-3 / METRES:.4g} scene units per metre" in said[0]
     assert "another" not in said[0]
-    points = dense_points(found, pool)
-    assert points.distances.numpy() == pytest.approx(
-        np.concatenate([depth.distances for depth in found]) * TRAINING.scale, rel=1e-5
-    )
+    expected = np.concatenate([depth.distances for depth in found]) * TRAINING.scale
+    assert dense_points(found, pool).distances.numpy() == pytest.approx(expected, rel=1e-5)
 
 
 def test_pixels_at_edges_of_depth_are_left_out(tmp_path):
@@ -147,8 +151,7 @@ def test_the_view_of_a_depth_camera_beside_the_photos_is_found(tmp_path):
     pool = place(tmp_path, [levels_of(z_of(camera, 0.1 * i - 0.025)) for i in range(6)])
     points = seen_points(known_points(pool, count=2000), pool)
     maps = [read_sensor_depth(frame.depth, frame.image).z for frame in pool.frames]  # type: ignore[arg-type]
-    fit = fitted(list(zip(points, maps, strict=True)))
-    assert fit is not None
+    fit = present(fitted(list(zip(points, maps, strict=True))))
     assert fit.registration.zoom == pytest.approx(1.1, abs=0.01)
     for z in (1.2, 2.4):  # at each depth, shift and parallax are the disparity, to two pixels: few points are at edges
         moved = fit.registration.in_map(np.array([[0.5, 0.5]]), np.array([z]))[0]
@@ -165,7 +168,7 @@ def test_a_registration_and_its_inverse_undo_each_other():
 
 def test_little_confidence_doubles_the_error_and_none_leaves_out(tmp_path):
     """ARKit's levels: 0, 1 and 2. Rows of the map have one each."""
-    pool = place(tmp_path, [levels_of(z_of(MAP, 0.1 * i)) for i in range(4)])
+    pool = place_panel(tmp_path)
     confidence = np.repeat(np.array([0, 1, 2], np.uint8), 20)[:, None].repeat(80, 1)
     cv2.imwrite(str(tmp_path / "confidence.png"), confidence)
     plain = measured(pool)[0]
@@ -194,7 +197,7 @@ def test_depths_that_nothing_confirms_are_not_used(tmp_path):
 
 def test_a_map_that_cannot_be_read_is_left_out_and_named(tmp_path):
     said: list[str] = []
-    pool = place(tmp_path, [levels_of(z_of(MAP, 0.1 * i)) for i in range(4)])
+    pool = place_panel(tmp_path)
     (tmp_path / "2.depth.png").write_bytes(b"no picture")
     found = measured(pool, said)
     assert [len(depth.pixels) > 0 for depth in found] == [True, True, False, True]
@@ -206,9 +209,8 @@ def walls(folder: Path) -> Capture:
     frames = []
     for index, x in enumerate((*OFFSETS, 0.75, -0.5)):
         one = photo(x)
-        z = truth(one.frame.camera, one.frame.world_from_cam)[0] * one.frame.camera.pixel_bearings()[0][:, 2].reshape(
-            150, 200
-        )
+        cosines = one.frame.camera.pixel_bearings()[0][:, 2].reshape(150, 200)
+        z = truth(one.frame.camera, one.frame.world_from_cam)[0] * cosines
         image, depth = folder / f"{index}.png", folder / f"{index}.tif"
         cv2.imwrite(str(image), one.pixels)
         tifffile.imwrite(depth, (z[::2, ::2] * METRES * 1000).astype(np.uint16))
@@ -218,19 +220,14 @@ def walls(folder: Path) -> Capture:
 
 @pytest.mark.parametrize("fixed", [(), ("sensor",)])
 def test_training_selects_the_depths_of_its_photos_and_reads_no_other(tmp_path, monkeypatch, fixed):
-    opened: list[str] = []
-    read = module.read_sensor_depth
-    monkeypatch.setattr(
-        module, "read_sensor_depth", lambda depth, image: opened.append(image.name) or read(depth, image)
-    )
-    said: list[str] = []
+    opened, said, read = list[str](), list[str](), module.read_sensor_depth
+    monkeypatch.setattr(module, "read_sensor_depth", lambda *given: opened.append(given[1].name) or read(*given))
     settings = TrainSettings(budget_seconds=None, steps=50, model="auto", fixed=fixed)
     inputs = prepare(walls(tmp_path), settings, run=tmp_path, notify=said.append)
     assert inputs.settings.components.sensor == (not fixed)
     assert set(opened) == (set() if fixed else {"0.png", "2.png", "3.png", "5.png"})
     if not fixed:
-        assert inputs.points is not None
-        known = inputs.points.sets[-1]
+        known = present(inputs.points).sets[-1]
         rays = inputs.pool.rays_of(known.numbers)
         scene = inputs.extent.training_from_scene.inverse()
         points = scene.apply((rays.origins + rays.directions * known.distances[:, None]).double().numpy())
@@ -248,11 +245,8 @@ def test_a_model_with_sensor_needs_maps(tmp_path):
 
 
 def test_known_distances_of_a_sensor_count_as_much_as_points():
-    assert [Components(points=p, sensor=s).distance_weight for p, s in ((0, False), (0, True), (0.3, True))] == [
-        0,
-        0.1,
-        0.3,
-    ]
+    weights = [Components(points=p, sensor=s).distance_weight for p, s in ((0, False), (0, True), (0.3, True))]
+    assert weights == [0, 0.1, 0.3]
 
 
 Z = np.linspace(4.0, 5.0, 20 * 30, dtype=np.float32).reshape(20, 30)
@@ -261,6 +255,13 @@ LEVELS = np.rint(Z * 1000).astype(np.uint16)
 
 def write_exr(path: Path) -> None:
     OpenEXR.File({"type": OpenEXR.scanlineimage}, {"R": Z}).write(str(path))
+
+
+@pytest.fixture
+def landscape(tmp_path: Path) -> Path:
+    """A photo whose shape is that of `Z`."""
+    Image.new("RGB", (300, 200)).save(tmp_path / "photo.jpg")
+    return tmp_path / "photo.jpg"
 
 
 WRITERS: dict[str, tuple[Callable[[Path], object], float]] = {
@@ -276,21 +277,19 @@ WRITERS: dict[str, tuple[Callable[[Path], object], float]] = {
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_maps_of_other_libraries_are_read(tmp_path, name):
+def test_maps_of_other_libraries_are_read(tmp_path, landscape, name):
     write, unit = WRITERS[name]
     write(tmp_path / name)
-    Image.new("RGB", (300, 200)).save(tmp_path / "photo.png")
-    z = read_sensor_depth(SensorDepth(tmp_path / name, unit), tmp_path / "photo.png").z
+    z = read_sensor_depth(SensorDepth(tmp_path / name, unit), landscape).z
     assert z == pytest.approx(Z, abs=0.5e-3 if unit == 1e-3 else 0.0)
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.pgm", "a.npy"])
-def test_what_was_not_measured_has_no_depth(tmp_path, name):
+def test_what_was_not_measured_has_no_depth(tmp_path, landscape, name):
     path, levels = tmp_path / name, np.full((20, 30), 2000, np.uint16)
     levels[5, 5], levels[10, 10] = 0, 65535
     cv2.imwrite(str(path), levels) if path.suffix != ".npy" else np.save(path, levels.astype(">u2"))
-    Image.new("RGB", (300, 200)).save(tmp_path / "photo.png")
-    z = read_sensor_depth(SensorDepth(path, 1e-3), tmp_path / "photo.png").z
+    z = read_sensor_depth(SensorDepth(path, 1e-3), landscape).z
     assert np.argwhere(np.isnan(z)).tolist() == [[5, 5], [10, 10]]
 
 
@@ -304,10 +303,8 @@ def test_a_map_turns_like_its_photo_unless_it_is_upright(tmp_path, orientation, 
     Image.new("RGB", (300, 200)).save(tmp_path / "photo.jpg", exif=exif)
     np.save(tmp_path / "stored.npy", Z)
     np.save(tmp_path / "upright.npy", turned)
-    stored, upright = (
-        read_sensor_depth(SensorDepth(tmp_path / f"{name}.npy"), tmp_path / "photo.jpg").z
-        for name in ("stored", "upright")
-    )
+    maps = (SensorDepth(tmp_path / f"{name}.npy") for name in ("stored", "upright"))
+    stored, upright = (read_sensor_depth(one, tmp_path / "photo.jpg").z for one in maps)
     assert stored.shape == (30, 20)
     assert np.array_equal(stored, upright, equal_nan=True)
 
@@ -323,28 +320,26 @@ def test_a_map_turns_like_its_photo_unless_it_is_upright(tmp_path, orientation, 
         (b"PK\x03\x04, as of an .npz file", "is not a depth map: ValueError"),
     ],
 )
-def test_what_is_no_map_of_the_photo_is_an_error(tmp_path, content, message):
+def test_what_is_no_map_of_the_photo_is_an_error(tmp_path, landscape, content, message):
     path = tmp_path / "a.npy"
     if isinstance(content, bytes):
         path.write_bytes(content)
     elif content is not None:
         np.save(path, content)
-    Image.new("RGB", (300, 200)).save(tmp_path / "photo.png")
     with pytest.raises(UserError, match=message):
-        read_sensor_depth(SensorDepth(path), tmp_path / "photo.png")
+        read_sensor_depth(SensorDepth(path), landscape)
 
 
-def test_maps_of_record3d_are_unpacked_with_lzfse(tmp_path, monkeypatch):
+def test_maps_of_record3d_are_unpacked_with_lzfse(tmp_path, landscape, monkeypatch):
     """The file does not tell its shape: it is that of the photo."""
     path = tmp_path / "0.depth"
     path.write_bytes(zlib.compress(Z.tobytes()))
-    Image.new("RGB", (300, 200)).save(tmp_path / "0.jpg")
     monkeypatch.setitem(sys.modules, "liblzfse", None)
     with pytest.raises(UserError, match="compressed with LZFSE"):
-        read_sensor_depth(SensorDepth(path), tmp_path / "0.jpg")
+        read_sensor_depth(SensorDepth(path), landscape)
     (tmp_path / "0.conf").write_bytes(zlib.compress(np.full((20, 30), 1, np.uint8).tobytes()))
     monkeypatch.setitem(sys.modules, "liblzfse", SimpleNamespace(decompress=zlib.decompress, error=zlib.error))
-    readings = read_sensor_depth(SensorDepth(path, confidence=tmp_path / "0.conf"), tmp_path / "0.jpg")
+    readings = read_sensor_depth(SensorDepth(path, confidence=tmp_path / "0.conf"), landscape)
     assert np.array_equal(readings.z, Z)
     assert (readings.confidence == 0.5).all()
 
@@ -408,8 +403,5 @@ def test_scenes_and_transforms_keep_maps(tmp_path):
 
 
 def test_no_sensor_depth_is_a_component_that_the_user_leaves_out():
-    from nerfcli.cli.options import Training
-    from nerfcli.cli.train import Fit
-
     settings = Fit(steps=10, sensor_depth=False).settings(Training())
     assert (settings.fixed, settings.components.sensor) == (("sensor",), False)

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import torch
 from frame_rays import frame_rays
+from present import present
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_quaternion
+from nerfcli.cameras.rigid import Similarity, from_parts, look_at, rotation_from_quaternion
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.machine import default_memory_limit, resident_bytes
@@ -37,31 +38,35 @@ from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.storage import IN_MEMORY, InFiles, MemoryNeeds, PhotoStorage, check_device_memory, storage_for
 
 CPU = torch.device("cpu")
-CAMERA = Camera.pinhole(40, 30, 50.0)
+CAMERA, MIDDLE = Camera.pinhole(40, 30, 50.0), np.array([1.0, 2.0, 3.0])
 MOVED = Similarity(250.0, rotation_from_quaternion(np.array([0.7, -0.1, 0.5, 0.5])), np.array([1e4, -2e4, 300.0]))
 
 
+def write_photo(path: Path, level: int = 90, *, height: int = 30, width: int = 40) -> Path:
+    write_png(path, np.full((height, width, 3), level, dtype=np.uint8))
+    return path
+
+
 def ring(count: int = 12, radius: float = 3.0, moved: Similarity | None = None) -> list[Frame]:
-    """Cameras at distances radius and 2 radius in turn about the point (1, 2, 3), looking at it."""
+    """Cameras at distances radius and 2 radius in turn about the middle, looking at it."""
     frames = []
     for index in range(count):
         angle = 2 * math.pi * index / count
         distance = radius * (1 + index % 2)
-        centre = np.array([1.0, 2.0, 3.0]) + distance * np.array([math.cos(angle), math.sin(angle), 0.5]) / 1.25**0.5
-        pose = look_at(centre, np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 1.0]))
+        centre = MIDDLE + distance * np.array([math.cos(angle), math.sin(angle), 0.5]) / 1.25**0.5
+        pose = look_at(centre, MIDDLE, np.array([0.0, 0.0, 1.0]))
         frames.append(Frame(f"{index:02d}.png", CAMERA, pose if moved is None else moved.apply_pose(pose)))
     return frames
 
 
 def scene_of(frames: list[Frame], points: np.ndarray | None = None) -> Capture:
-    return Capture(
-        root=Path("."),
-        kind="transforms",
-        frames=tuple(frames),
-        test_names=frozenset(),
-        points=np.zeros((0, 3)) if points is None else points,
-        missing=(),
-    )
+    return Capture(tuple(frames), np.zeros((0, 3)) if points is None else points, kind="transforms")
+
+
+def sphere(radius: float, count: int) -> np.ndarray:
+    """Return points (N, 3) all around the point that the cameras of `ring` look at."""
+    directions = np.random.default_rng(0).normal(size=(count, 3))
+    return MIDDLE + radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def training_centres(scene: Capture, similarity: Similarity) -> np.ndarray:
@@ -71,7 +76,7 @@ def training_centres(scene: Capture, similarity: Similarity) -> np.ndarray:
 def test_unbounded_scenes_are_centred_where_cameras_look_and_reach_to_the_median_camera():
     scene = scene_of(ring())
     similarity, marching = contracted_frame(scene)
-    np.testing.assert_allclose(similarity.apply(np.array([1.0, 2.0, 3.0])), 0, atol=1e-9)
+    np.testing.assert_allclose(similarity.apply(MIDDLE), 0, atol=1e-9)
     distances = np.linalg.norm(training_centres(scene, similarity), axis=1)
     assert np.median(distances) == pytest.approx(1, abs=1e-9)
     assert marching.far > 100 * distances.max()
@@ -109,27 +114,22 @@ def test_the_training_frame_can_be_undone_and_does_not_depend_on_where_the_captu
 
 def test_the_unit_ball_reaches_what_cameras_see_where_it_is_behind_them():
     """Walls at 10 and cameras at 3 and 6 from the middle: the median depths of cameras are about 13 and 16."""
-    directions = np.random.default_rng(0).normal(size=(20000, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    middle = np.array([1.0, 2.0, 3.0])
-    walls = middle + 10 * directions
+    walls = sphere(10, 20000)
     radius = 1 / contracted_frame(scene_of(ring(), walls))[0].scale
     assert radius == pytest.approx(0.75 * 14.5, rel=0.05)
     # A few stray points far away change little; too few points are ignored.
-    stray = np.concatenate([walls, middle + 1e6 * directions[:500]])
+    stray = np.concatenate([walls, sphere(1e6, 500)])
     assert 1 / contracted_frame(scene_of(ring(), stray))[0].scale == pytest.approx(radius, rel=0.02)
     assert 1 / contracted_frame(scene_of(ring(), walls[:20]))[0].scale == pytest.approx(4.5, rel=1e-9)
     # An object surrounded by the cameras is in front of them and changes nothing.
-    assert 1 / contracted_frame(scene_of(ring(), middle + directions))[0].scale == pytest.approx(4.5, rel=1e-9)
+    assert 1 / contracted_frame(scene_of(ring(), sphere(1, 20000)))[0].scale == pytest.approx(4.5, rel=1e-9)
 
 
 def test_panoramas_are_as_far_from_all_around_them_as_from_what_is_ahead():
     """From the middle of a sphere of radius 10, z of half of the points ahead is less than 5."""
-    directions = np.random.default_rng(0).normal(size=(2000, 3))
-    walls = np.array([1.0, 2.0, 3.0]) + 10 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     panorama = Camera("EQUIRECTANGULAR", 64, 32, (64, 32))
     frames = [replace(frame, camera=panorama) for frame in ring(radius=0.01)]
-    similarity, _, background = narrow_frame(scene_of(frames, walls))
+    similarity, _, background = narrow_frame(scene_of(frames, sphere(10, 2000)))
     assert 1 / similarity.scale == pytest.approx(10, rel=0.01)
     assert background == pytest.approx(2.5, rel=0.01)
 
@@ -156,8 +156,7 @@ def test_a_box_needs_points():
 
 def test_near_is_before_what_the_cameras_see():
     # Points on a ball of radius 2 around the focus; the nearest one to each camera is at least 1 away.
-    normals = np.random.default_rng(0).normal(size=(4000, 3))
-    points = np.array([1.0, 2.0, 3.0]) + 2 * normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    points = sphere(2, 4000)
     scene = scene_of(ring(), points)
     similarity, marching = contracted_frame(scene)
     nearest = min(np.linalg.norm(points - frame.centre, axis=1).min() for frame in scene.frames)
@@ -166,9 +165,7 @@ def test_near_is_before_what_the_cameras_see():
 
 def test_depth_bounds_of_forward_facing_captures_set_the_focus():
     # Parallel cameras do not look at a common point: the focus is 1.6, the harmonic mean of the bounds, before them.
-    frames = [replace(f, world_from_cam=np.eye(4)) for f in ring(5)]
-    for index, frame in enumerate(frames):
-        frame.world_from_cam[:3, 3] = (index - 2, 0, 0)
+    frames = side_by_side(-2, -1, 0, 1, 2)
     scene = replace(scene_of(frames), depth_bounds=np.tile([1.0, 4.0], (5, 1)))
     similarity, marching = contracted_frame(scene)
     np.testing.assert_allclose(similarity.inverse().apply(np.zeros(3)), [0, 0, 1.6], atol=1e-6)
@@ -177,12 +174,9 @@ def test_depth_bounds_of_forward_facing_captures_set_the_focus():
 
 def side_by_side(*places: float, turned: Similarity | None = None) -> list[Frame]:
     """Parallel cameras on a line, looking along +z."""
-    frames = []
-    for number, place in enumerate(places):
-        pose = np.eye(4)
-        pose[0, 3] = place
-        frames.append(Frame(f"{number}.png", CAMERA, pose if turned is None else turned.apply_pose(pose)))
-    return frames
+    poses = [from_parts(np.eye(3), np.array([place, 0.0, 0.0])) for place in places]
+    poses = poses if turned is None else [turned.apply_pose(pose) for pose in poses]
+    return [Frame(f"{number}.png", CAMERA, pose) for number, pose in enumerate(poses)]
 
 
 @pytest.mark.parametrize("spread", [0.3, 0.99, 1.01, 3.0])
@@ -201,9 +195,8 @@ def test_a_narrow_baseline_is_one_below_half_of_the_nearest_depth(spread):
         assert extent.reach == pytest.approx(np.linalg.norm(centres, axis=1).max() + BALLS_BEFORE_BACKGROUND)
     assert not has_narrow_baseline(replace(scene, depth_bounds=None))
     # Bounds that begin at the cameras give no radius, not even to cameras that only turn.
-    assert not has_narrow_baseline(
-        replace(scene_of(side_by_side(0.0, 0.0)), depth_bounds=np.array([[0.0, 8.0], [0.0, 8.0]]))
-    )
+    turning = replace(scene_of(side_by_side(0.0, 0.0)), depth_bounds=np.array([[0.0, 8.0], [0.0, 8.0]]))
+    assert not has_narrow_baseline(turning)
     # An object on an empty background needs no depth.
     assert choose_extent(scene, TrainSettings(), is_object=True).contraction == "none"
 
@@ -322,29 +315,23 @@ def test_photos_with_and_without_alpha_go_together():
 
 
 def test_masks_shrink_to_pixels_that_are_used_whole(tmp_path):
-    write_png(tmp_path / "photo.png", np.full((30, 40, 3), 90, dtype=np.uint8))
     mask = np.full((30, 40, 3), 255, dtype=np.uint8)
     mask[5, 9] = 0
     write_png(tmp_path / "mask.png", mask)
-    frame = replace(ring()[0], image=tmp_path / "photo.png", mask=tmp_path / "mask.png")
+    frame = replace(ring()[0], image=write_photo(tmp_path / "photo.png"), mask=tmp_path / "mask.png")
     (photo,) = load_photos([frame], factor=2, threads=1)
-    assert photo.used is not None
     expected = np.ones((15, 20), dtype=bool)
     expected[2, 4] = False
-    np.testing.assert_array_equal(photo.used, expected)
+    np.testing.assert_array_equal(present(photo.used), expected)
 
 
 def test_photos_that_do_not_fit_their_camera_are_reported(tmp_path):
-    write_png(tmp_path / "photo.png", np.zeros((30, 40, 3), dtype=np.uint8))
-    write_png(tmp_path / "small.png", np.zeros((15, 20, 3), dtype=np.uint8))
+    photo, small = write_photo(tmp_path / "photo.png"), write_photo(tmp_path / "small.png", height=15, width=20)
     frame = ring()[0]
     for wrong, message in (
         (frame, r"00\.png has no photo"),
-        (replace(frame, image=tmp_path / "small.png"), r"small\.png is 20x15 pixels, but its camera is for 40x30"),
-        (
-            replace(frame, image=tmp_path / "photo.png", mask=tmp_path / "small.png"),
-            r"small\.png is 20x15, but its photo is 40x30",
-        ),
+        (replace(frame, image=small), r"small\.png is 20x15 pixels, but its camera is for 40x30"),
+        (replace(frame, image=photo, mask=small), r"small\.png is 20x15, but its photo is 40x30"),
         (replace(frame, image=tmp_path / "gone.png"), r"photo not found: .*gone\.png"),
     ):
         with pytest.raises(UserError, match=message):
@@ -352,10 +339,8 @@ def test_photos_that_do_not_fit_their_camera_are_reported(tmp_path):
 
 
 def test_photos_come_in_the_order_of_their_frames(tmp_path):
-    frames = []
-    for index, frame in enumerate(ring()):
-        write_png(tmp_path / frame.name, np.full((30, 40, 3), 10 * index, dtype=np.uint8))
-        frames.append(replace(frame, image=tmp_path / frame.name))
+    numbered = enumerate(ring())
+    frames = [replace(frame, image=write_photo(tmp_path / frame.name, 10 * index)) for index, frame in numbered]
     photos = load_photos(frames, factor=2, threads=4)
     assert [int(photo.pixels[0, 0, 0]) for photo in photos] == [10 * index for index in range(12)]
     assert {photo.pixels.shape for photo in photos} == {(15, 20, 3)}
@@ -468,9 +453,8 @@ def test_what_does_not_fit_is_refused_up_front(tmp_path):
     room, reported = storage_for(needs, 2 * 10**9, folder=tmp_path)
     assert isinstance(room, InFiles)
     assert "about 4.00 GB needed, limit 2.00 GB: the photos (3.00 GB) are kept in temporary files" in reported
-    with pytest.raises(
-        UserError, match=r"needs about 1\.00 GB of memory in addition to the photos, but the limit is 0\.90 GB"
-    ) as caught:
+    said = r"needs about 1\.00 GB of memory in addition to the photos, but the limit is 0\.90 GB"
+    with pytest.raises(UserError, match=said) as caught:
         storage_for(needs, 9 * 10**8, folder=tmp_path)
     assert caught.value.exit_code == OUT_OF_MEMORY
 
