@@ -10,6 +10,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import pytest
+
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 # Software rendering on a busy machine compiles a shader in seconds.
 SECONDS = 180.0
@@ -18,6 +20,9 @@ SECONDS = 180.0
 def find_browser() -> str | None:
     """Return the path of the browser's program, or None if there is none."""
     return next((found for name in NAMES if (found := shutil.which(name))), None)
+
+
+needs_browser = pytest.mark.skipif(find_browser() is None, reason="there is no Chromium here to open the page with")
 
 
 class Browser:

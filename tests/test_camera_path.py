@@ -67,9 +67,8 @@ def test_pixels_see_where_nerfstudio_says(tmp_path, kind):
     assert valid.all()
     expected = nerfstudio_directions(kind, 60.0, pixels, width=64, height=48)
     world_from_opengl = np.array(OPENGL_POSE).reshape(4, 4)[:3, :3]
-    np.testing.assert_allclose(
-        directions @ frame.world_from_cam[:3, :3].T, expected @ world_from_opengl.T, rtol=0, atol=1e-12
-    )
+    found = directions @ frame.world_from_cam[:3, :3].T
+    np.testing.assert_allclose(found, expected @ world_from_opengl.T, rtol=0, atol=1e-12)
 
 
 def test_the_fov_is_vertical_and_of_a_fisheye_only_a_name_for_its_focal_length(tmp_path):

@@ -13,6 +13,7 @@ import torch
 from commands import completed, error_of, nerfcli
 from fog import fog, foggy_cells
 from PIL import Image
+from present import present
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -192,13 +193,9 @@ def test_nothing_is_seen_beyond_the_edges_of_the_picture():
 
 def test_depths_of_a_field_are_those_of_its_surface():
     """A cube of fog: half of the light ends ln 2 / density behind its face."""
-    scene = Similarity(0.5, np.eye(3), np.array([0.0, 0.0, 0.0]))
-    model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), scene)
-    frame = Frame(
-        "a",
-        Camera("SIMPLE_RADIAL", 400, 300, (300.0, 200.0, 150.0, -0.05)),
-        look_at(np.array([0.0, 0.0, -4.0]), np.zeros(3), np.array([0.0, -1.0, 0.0])),
-    )
+    model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), Similarity(0.5, np.eye(3), np.zeros(3)))
+    pose = look_at(np.array([0.0, 0.0, -4.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
+    frame = Frame("a", Camera("SIMPLE_RADIAL", 400, 300, (300.0, 200.0, 150.0, -0.05)), pose)
     (view,) = depth_maps(model, [frame], max_size=40)
     assert view.distances.shape == (30, 40)
     assert view.frame.camera == frame.camera.resized(40, 30)
@@ -235,16 +232,12 @@ def test_render_writes_coverage_and_parallax_and_removes_depth(run, tmp_path):
     facts = json.loads((tmp_path / "views/render.json").read_text())["facts"]
     assert sum(of_view["pixels_with_depth"] for of_view in facts.values()) == np.isfinite(before).sum()
     # What the files say of themselves.
-    (of_depth, of_coverage, of_parallax) = (
-        depth_meta_of(next((tmp_path / "views" / name).rglob("*.tiff"))) for name in ("depth", "coverage", "parallax")
-    )
-    assert of_depth is not None
-    assert of_coverage is not None
-    assert of_parallax is not None
+    files = [next((tmp_path / "views" / name).rglob("*.tiff")) for name in ("depth", "coverage", "parallax")]
+    of_depth, of_coverage, of_parallax = (present(depth_meta_of(file)) for file in files)
     assert (of_depth.min_views, of_depth.min_parallax_deg) == (4, 50.0)
     assert (of_coverage.unit, of_parallax.unit, of_coverage.min_views) == ("photos", "degrees", 0)
     assert of_coverage.provenance["training_photos"] == 21
-    text = nerfcli("info", next((tmp_path / "views/parallax").rglob("*.tiff"))).stdout
+    text = nerfcli("info", files[2]).stdout
     assert "parallax, in degrees: the largest angle between the rays of two training photos" in text
     assert "min views: 4" in nerfcli("info", next((tmp_path / "views").rglob("*.exr"))).stdout
     again = nerfcli(*common, "--outputs", "depth,coverage,parallax", "-o", tmp_path / "views")

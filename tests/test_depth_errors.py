@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 from commands import completed, nerfcli
+from present import present
 
 from nerfcli.captures.formats.run_cameras import RunCameras
 from nerfcli.errors import UserError
@@ -109,11 +110,10 @@ def test_errors_are_those_between_matched_and_median_distances(spheres_run, monk
     expected, matched = [], []
     for frame in run.cameras.test:
         picture = render_picture(model, frame, background=model.background, depth=DepthRequest("median", "ray"))
-        assert picture.depth is not None
         truth = tifffile.imread(TRUTH / f"{Path(frame.name).stem}_distance.tiff")
         matched.append(np.isfinite(truth).mean())
-        expected.append((truth / picture.depth - 1)[np.isfinite(truth) & np.isfinite(picture.depth)])
-    every = np.concatenate(expected)
+        expected.append(truth / present(picture.depth) - 1)
+    every = np.concatenate([errors[np.isfinite(errors)] for errors in expected])
     assert found.photos == 3
     assert found.matched == pytest.approx(np.mean(matched))
     assert 0.9 * len(every) < sum(found.pixels) <= len(every)
@@ -140,17 +140,17 @@ def test_a_run_without_held_out_photos_has_no_intervals(spheres_run):
         measure_depth_errors(run, run.model(), [], threads=1)
 
 
+def maps_in(views: Path, *names: str) -> list[np.ndarray]:
+    """Return the maps (views, height, width) of each name, and the true distances."""
+    paths = [(views / name).rglob("*.tiff") for name in names]
+    return [np.stack([tifffile.imread(path) for path in sorted(of)]) for of in (*paths, TRUTH.glob("*_distance.tiff"))]
+
+
 def test_render_writes_the_interval_and_keeps_the_errors(copied, tmp_path, monkeypatch):
     monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth())
     common = ("render", copied, "--depth", "median", "--depth-axis", "ray", "--threads", "2")
     completed(*common, "--outputs", "depth,coverage,lower,upper", "-o", tmp_path / "views")
-    depth, coverage, lower, upper, truth = (
-        np.stack([tifffile.imread(path) for path in sorted(paths)])
-        for paths in (
-            *((tmp_path / "views" / name).rglob("*.tiff") for name in ("depth", "coverage", "lower", "upper")),
-            TRUTH.glob("*_distance.tiff"),
-        )
-    )
+    depth, coverage, lower, upper, truth = maps_in(tmp_path / "views", "depth", "coverage", "lower", "upper")
     seen = coverage >= 4
     inside = (lower <= truth) & (truth <= upper)
     assert inside[seen & np.isfinite(truth)].mean() == pytest.approx(0.9, abs=0.01)
@@ -158,8 +158,7 @@ def test_render_writes_the_interval_and_keeps_the_errors(copied, tmp_path, monke
     assert np.isnan(lower[coverage == 0]).all()
     assert np.isnan(upper[np.isnan(depth)]).all()
     path = next((tmp_path / "views/lower").rglob("*.tiff"))
-    meta = depth_meta_of(path)
-    assert meta is not None
+    meta = present(depth_meta_of(path))
     assert (meta.quantity, meta.convention, meta.provenance["measured_photos"]) == ("lower", "lower:0.9", 3)
     assert "lower end of the 90 % interval of depth along the ray" in nerfcli("info", path).stdout
     # The errors are read, not measured again.
@@ -171,17 +170,10 @@ def test_render_writes_the_interval_and_keeps_the_errors(copied, tmp_path, monke
 def test_render_writes_the_proportion_of_depths_within_the_tolerance(copied, tmp_path, monkeypatch):
     """With errors measured from the true distances of the same pictures, confidence equals this proportion."""
     monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth())
-    common = ("render", copied, "--depth", "median", "--depth-axis", "ray", "--threads", "2")
-    common += ("--depth-format", "tiff,exr")
+    common = ("render", copied, "--depth", "median", "--depth-axis", "ray", "--depth-format", "tiff,exr")
     outputs = ("--outputs", "depth,coverage,confidence", "-o", tmp_path / "views")
     completed(*common, *outputs)
-    depth, coverage, confidence, truth = (
-        np.stack([tifffile.imread(path) for path in sorted(paths)])
-        for paths in (
-            *((tmp_path / "views" / name).rglob("*.tiff") for name in ("depth", "coverage", "confidence")),
-            TRUTH.glob("*_distance.tiff"),
-        )
-    )
+    depth, coverage, confidence, truth = maps_in(tmp_path / "views", "depth", "coverage", "confidence")
     compared = (coverage >= 4) & np.isfinite(truth)
     within = np.abs(truth - depth)[compared] <= 0.02 * depth[compared]
     assert 0.2 < within.mean() < 0.95
@@ -191,8 +183,7 @@ def test_render_writes_the_proportion_of_depths_within_the_tolerance(copied, tmp
     exr = min((tmp_path / "views").rglob("*.exr"))
     np.testing.assert_array_equal(read_exr(exr)["confidence.V"], confidence[0])
     path = min((tmp_path / "views" / "confidence").rglob("*.tiff"))
-    meta = depth_meta_of(path)
-    assert meta is not None
+    meta = present(depth_meta_of(path))
     assert (meta.quantity, meta.convention, meta.unit) == ("confidence", "confidence:0.02", "fractions of 1")
     assert "confidence, in fractions of 1: the proportion of depths" in nerfcli("info", path).stdout
     preview = nerfcli("info", path.with_suffix(".png")).stdout

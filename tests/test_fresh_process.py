@@ -50,9 +50,8 @@ def modules() -> dict[str, set[str]]:
     program = "import json, sys\nfor name, code in json.loads(sys.argv[1]).items():\n"
     program += "    before = set(sys.modules)\n    exec(code, {})\n"
     program += "    print(json.dumps([name, sorted(set(sys.modules) - before)]), flush=True)\n"
-    ended = subprocess.run(
-        [sys.executable, "-c", program, json.dumps(CODES)], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-c", program, json.dumps(CODES)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
     added = {name: set(names) for name, names in map(json.loads, ended.stdout.splitlines())}
     if ended.returncode:
         added["stderr"] = {ended.stderr}

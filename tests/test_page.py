@@ -14,13 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from browser import Browser, find_browser
+from browser import Browser, find_browser, needs_browser
 from fog import SIDE
 from page_arithmetic import PageField, array, element
+from present import present
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_vector
+from nerfcli.cameras.rigid import Similarity, from_parts, look_at, rotation_from_vector
 from nerfcli.captures.formats.camera_path import read_path
 from nerfcli.errors import UserError
 from nerfcli.field.background import SphereBackground
@@ -40,7 +41,7 @@ from nerfcli.render.trained_field import Marching
 from nerfcli.training.runs.run import Run
 from nerfcli.viewer.packing import FINEST_LEVEL, pack_model, quantised, reached_rows, seen_cells
 from nerfcli.viewer.page import numbers_of, page_html, scene_of
-from nerfcli.viewer.pictures import HEIGHT, WIDTH, PagePhotos, Proof, make_proof, page_photos
+from nerfcli.viewer.pictures import HEIGHT, WIDTH, Proof, make_proof, page_photos
 from nerfcli.workflows import photo_depths
 from nerfcli.workflows.export import export_run
 
@@ -80,24 +81,14 @@ def rough(field: Field, *, sky: bool = False) -> Model:
 
 
 def page_of(model: Model, frames: list[Frame], proof: Proof) -> str:
-    photos = PagePhotos([], 0)
-    numbers = numbers_of(pack_model(model), proof, UNSEEN)
     box = (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
-    scene = scene_of(model, run=Path("a run"), frames=frames, photos=photos.entries, box=box)
-    return page_html(scene, numbers)
+    scene = scene_of(model, run=Path("a run"), frames=frames, photos=[], box=box)
+    return page_html(scene, numbers_of(pack_model(model), proof, UNSEEN))
 
 
 def hash_settings(contraction: str, *, antialias: bool = False, view_degree: int = 3) -> HashFieldSettings:
-    return HashFieldSettings(
-        contraction=contraction,
-        levels=3,
-        log2_rows=10,
-        coarsest=4,
-        finest=40,
-        width=16,
-        antialias=antialias,
-        view_degree=view_degree,
-    )
+    small = HashFieldSettings(contraction=contraction, levels=3, log2_rows=10, coarsest=4, finest=40, width=16)
+    return replace(small, antialias=antialias, view_degree=view_degree)
 
 
 @pytest.mark.parametrize(
@@ -114,16 +105,13 @@ def test_the_numbers_in_the_page_render_what_the_kernels_render(field, sky):
     """Against an independent implementation of the shader, applied to the page's own text."""
     model, frame = rough(field, sky=sky), at((1.6, -0.4, 0.8))
     page = page_of(model, [frame], NO_PROOF)
-    pages_view = json.loads(element(page, "scene"))["home"]
-    traced = PageField(page).trace(pages_view)
+    traced = PageField(page).trace(json.loads(element(page, "scene"))["home"])
     request = DepthRequest("median", "ray", min_opacity=0.0)
     picture = render_picture(model, frame, background=model.background, depth=request)
-    assert picture.depth is not None
-    assert picture.spread is not None
     assert picture.rgb.std() > 0.02
     np.testing.assert_allclose(traced.rgb.reshape(picture.rgb.shape), picture.rgb, atol=COLOUR_BOUND)
     np.testing.assert_allclose(traced.opacity.reshape(picture.opacity.shape), picture.opacity, atol=COLOUR_BOUND)
-    for ours, kernels in ((traced.median, picture.depth), (traced.spread, picture.spread)):
+    for ours, kernels in ((traced.median, present(picture.depth)), (traced.spread, present(picture.spread))):
         mine = ours.reshape(kernels.shape) / SIMILARITY.scale
         alike = np.isclose(mine, kernels, rtol=2e-3, atol=2e-3, equal_nan=True)
         assert alike.mean() > AGREEING
@@ -252,9 +240,8 @@ def spheres_page(spheres_run, tmp_path_factory) -> Path:
     run = shutil.copytree(spheres_run, spheres_run.with_name(f"page-run-{os.getpid()}"))  # it keeps depths of photos
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(photo_depths, "MAX_SIZE", PHOTO_SIZE)
-        return export_run(
-            run, Output(tmp_path_factory.mktemp("page") / "spheres.html"), to="page", resources=Resources(2)
-        )
+        output = Output(tmp_path_factory.mktemp("page") / "spheres.html")
+        return export_run(run, output, to="page", resources=Resources(2))
 
 
 @pytest.fixture(scope="module")
@@ -263,10 +250,6 @@ def browser(tmp_path_factory) -> Iterator[Browser]:
         pytest.skip("there is no Chromium on this machine to open the page with")
     with Browser(tmp_path_factory.mktemp("profile"), width=420, height=200) as opened:
         yield opened
-
-
-def rested(browser: Browser) -> int:
-    return int(browser.run("Number(document.body.dataset.rested || 0)"))
 
 
 @pytest.fixture
@@ -281,9 +264,7 @@ def opened(browser, spheres_page) -> Browser:
 
 
 def test_the_browser_draws_what_nerfcli_renders(opened):
-    found = json.loads(
-        opened.run("(() => { nerfcliPage.check(); return document.getElementById('checked').dataset.found; })()")
-    )
+    found = json.loads(opened.run("(nerfcliPage.check(), document.getElementById('checked').dataset.found)"))
     assert found["colour"]["largest"] <= COLOUR_BOUND
     assert found["opacity"]["largest"] <= COLOUR_BOUND + FINE_BOUND
     assert found["colour"]["rms"] <= 2e-4
@@ -307,23 +288,21 @@ def test_the_browser_shows_how_many_photos_see_the_surface(opened, spheres_run):
         " return ['coverage', 'parallax'].map(map => pixels.map(i => value(map, i))); })()"
     )
     coverage, parallax = np.array(drawn, dtype=float)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = camera["turn"], camera["place"]
+    pose = from_parts(camera["turn"], camera["place"])
     frame = Frame("a.png", Camera("PINHOLE", WIDTH, HEIGHT, tuple(camera["lens"])), pose)
     request = DepthRequest("median", "ray")
     picture = render_picture(model, frame, background=model.background, depth=request)
-    exact = with_coverage(picture, frame, axis="ray", photo_depths=photos)
-    assert picture.depth is not None
-    assert exact.coverage is not None
-    there = np.isfinite(coverage) & np.isfinite(picture.depth.ravel())
+    exact = present(with_coverage(picture, frame, axis="ray", photo_depths=photos).coverage).ravel()
+    depth = present(picture.depth).ravel()
+    there = np.isfinite(coverage) & np.isfinite(depth)
     assert there.sum() > 300
-    assert (np.isfinite(coverage) == np.isfinite(picture.depth.ravel())).mean() > AGREEING
+    assert (np.isfinite(coverage) == np.isfinite(depth)).mean() > AGREEING
     rays, _ = frame.camera.pixel_bearings()
-    points = (rays * picture.depth.reshape(-1, 1))[there] @ pose[:3, :3].T + pose[:3, 3]
+    points = (rays * depth[:, None])[there] @ pose[:3, :3].T + pose[:3, 3]
     found = cell_values(model, cells, points)
     assert (coverage[there] == found % 256).mean() > AGREEING
     assert (parallax[there] == found // 256).mean() > AGREEING
-    strata = [np.searchsorted((1, 2, 4), values[there], side="right") for values in (coverage, exact.coverage.ravel())]
+    strata = [np.searchsorted((1, 2, 4), values[there], side="right") for values in (coverage, exact)]
     assert (strata[0] == strata[1]).mean() > 0.9
     opened.run("nerfcliPage.choose(MAPS.indexOf('coverage'))")
     opened.wait("nerfcliPage.done")
@@ -397,10 +376,7 @@ def test_a_photo_is_stood_at_wiped_over_and_subtracted(opened):
     opened.drag(middle, (middle[0] - box["width"] / 4, middle[1]))
     assert opened.run("document.getElementById('wipe').getAttribute('aria-valuenow')") == "25"
     assert "0px 75." in opened.run("document.getElementById('photo').style.clipPath")
-    opened.run(
-        "(() => { const c = document.getElementById('compare'); c.value = 'error';"
-        " c.dispatchEvent(new Event('change')); })()"
-    )
+    opened.run("$('compare').value = 'error', $('compare').dispatchEvent(new Event('change'))")
     opened.wait("/ dB at/.test(document.getElementById('status').textContent)")
     decibels = float(re.findall(r"([\d.]+) dB", opened.run("document.getElementById('status').textContent"))[0])
     assert decibels > 15  # the training of the fixture is short; a misplaced picture has about 8
@@ -459,10 +435,8 @@ def test_the_path_is_a_camera_path_that_render_reads(opened, tmp_path):
 
 
 def test_a_lost_context_is_reported_and_restored(opened):
-    count = rested(opened)
-    opened.run(
-        "globalThis.lose = nerfcliPage.renderer.gl.getExtension('WEBGL_lose_context'); globalThis.lose.loseContext()"
-    )
+    count = int(opened.run("document.body.dataset.rested"))
+    opened.run("(globalThis.lose = nerfcliPage.renderer.gl.getExtension('WEBGL_lose_context')).loseContext()")
     opened.wait("!document.getElementById('trouble').hidden")
     assert "graphics context" in opened.run("document.getElementById('trouble').textContent")
     opened.run("globalThis.lose.restoreContext()")
@@ -495,9 +469,8 @@ def test_a_damaged_page_says_so(damage, message, browser, spheres_page, tmp_path
     assert message in browser.run("document.getElementById('trouble').textContent")
 
 
+@needs_browser
 def test_a_browser_without_webgl2_is_reported(spheres_page, tmp_path):
-    if find_browser() is None:
-        pytest.skip("there is no Chromium on this machine to open the page with")
     with Browser(tmp_path, flags=("--disable-3d-apis",)) as browser:
         browser.open(spheres_page)
         browser.wait("document.body.dataset.state === 'trouble'")

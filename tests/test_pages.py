@@ -13,6 +13,7 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 from markupsafe import escape
+from present import present
 
 from nerfcli.errors import UserError
 from nerfcli.output import Output
@@ -27,9 +28,7 @@ def simple(path: Path = Path("here"), *, script: str = "") -> str:
 
 def test_a_page_allows_no_loading_and_no_script_that_it_has_not():
     policy = re.compile('Content-Security-Policy" content="([^"]+)"')
-    without, with_script = (policy.search(simple(script=script)) for script in ("", "let a = 1"))
-    assert without is not None
-    assert with_script is not None
+    without, with_script = (present(policy.search(simple(script=script))) for script in ("", "let a = 1"))
     assert without[1].startswith("default-src 'none'")
     assert "script-src" not in without[1]
     assert "script-src 'unsafe-inline'" in with_script[1]
@@ -73,11 +72,9 @@ def test_pictures_read_back_by_another_reader():
     picture = np.stack([np.tile(ramp, (48, 1)), np.full((48, 64), 30, np.uint8), np.zeros((48, 64), np.uint8)], axis=-1)
     uri = page.data_uri(page.png_bytes(picture), "png")
     data = base64.b64decode(uri.removeprefix("data:image/png;base64,"))
-    again = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert again is not None
+    again = present(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
     np.testing.assert_array_equal(again[..., ::-1], picture)
-    small = cv2.imdecode(np.frombuffer(page.jpeg_bytes(picture, longest_px=32), np.uint8), cv2.IMREAD_COLOR)
-    assert small is not None
+    small = present(cv2.imdecode(np.frombuffer(page.jpeg_bytes(picture, longest_px=32), np.uint8), cv2.IMREAD_COLOR))
     assert small.shape == (24, 32, 3)
     wanted = picture.reshape(24, 2, 32, 2, 3).mean((1, 3))
     assert np.abs(small[..., ::-1] - wanted).max() < 8

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from fog import SIDE, fog, foggy_cells
+from present import present
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -40,8 +41,7 @@ def test_no_bit_depends_on_tiles_or_threads(trained, monkeypatch):
     model, frame = trained
     options = {"background": BLACK, "depth": DepthRequest("median", "z", 0.1), "tolerance": 1e-3}
     whole = render_picture(model, frame, **options)
-    assert whole.depth is not None
-    assert 0.1 < np.isfinite(whole.depth).mean() < 0.9
+    assert 0.1 < np.isfinite(present(whole.depth)).mean() < 0.9
     for tile, threads in ((1, 2), (7, 1), (64, 2), (4095, 1)):
         torch.set_num_threads(threads)
         counts: list[int] = []
@@ -71,9 +71,8 @@ def test_what_is_left_out_stays_within_the_bound_and_the_tolerance(background, t
 
 def test_a_ray_that_sees_all_misses_nothing():
     # Fog of optical depth 1/2 in front of a background: no early stop, and every sample's colour is evaluated.
-    picture = render_picture(
-        fog(foggy_cells((-1, -1, 0), (1, 1, 0.5)), Similarity.identity()), TOWARDS, background=BLACK
-    )
+    model = fog(foggy_cells((-1, -1, 0), (1, 1, 0.5)), Similarity.identity())
+    picture = render_picture(model, TOWARDS, background=BLACK)
     assert picture.opacity.max() > 0.3
     assert picture.truncation_error.max() == 0
 
@@ -97,9 +96,8 @@ def test_black_background_is_premultiplied():
     model, frame = two_walls(), TOWARDS
     on_black = render_picture(model, frame, background=BLACK)
     on_white = render_picture(model, frame, background=(1.0, 1.0, 1.0))
-    np.testing.assert_allclose(
-        on_white.rgb, on_black.rgb + (1 - on_black.opacity[..., None]), atol=2e-6, err_msg="alpha compositing"
-    )
+    composited = on_black.rgb + (1 - on_black.opacity[..., None])
+    np.testing.assert_allclose(on_white.rgb, composited, atol=2e-6)
 
 
 def test_straight_alpha_is_the_colour_of_what_is_there():
@@ -133,10 +131,8 @@ def test_quadrature_error_shrinks_with_the_step_and_repeats():
     # The only error is at the borders of the fog, which fall somewhere inside of an interval.
     request = DepthRequest("conditional", "z", 0.1)
     cells = foggy_cells((-1, -1, 0), (1, 1, 4 / SIDE))
-    coarse, fine = (
-        measure_error(fog(cells, Similarity.identity(), step=step), TOWARDS, depth=request)
-        for step in (1 / 20, 1 / 160)
-    )
+    foggy = [fog(cells, Similarity.identity(), step=step) for step in (1 / 20, 1 / 160)]
+    coarse, fine = (measure_error(model, TOWARDS, depth=request) for model in foggy)
     assert coarse["pixels_measured"] == fine["pixels_measured"] == 256
     for name in ("quadrature_of_colour_p95", "quadrature_of_depth_p95"):
         assert coarse[name] / fine[name] == pytest.approx(8, rel=0.5)

@@ -2,12 +2,14 @@
 
 import math
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from fog import SIDE, STEP, fog, foggy_cells
 from frame_rays import frame_rays
+from present import present
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -57,6 +59,12 @@ def inside_slab(far: float = 2.4) -> np.ndarray:
 
 def picture_of(model: Model, frame: Frame, depth: DepthRequest | None = None) -> RenderedPicture:
     return render_picture(model, frame, background=BACKGROUND, depth=depth)
+
+
+def z_and_distance(model: Model, **request: Any) -> list[np.ndarray]:
+    """Return the depth (H, W) of what `towards_slab` sees along both axes."""
+    requests = (DepthRequest(axis=axis, **request) for axis in ("z", "ray"))
+    return [present(picture_of(model, towards_slab(), wanted).depth) for wanted in requests]
 
 
 def chords(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -117,11 +125,7 @@ def test_depth_of_a_slab_in_closed_form_along_both_axes(convention):
         model, pixels = fog(foggy_cells((-1, -1, 0.0), (1, 1, 1)), SIMILARITY), inside_slab(1.9 + math.log(2))
     else:
         model, pixels = fog(SLAB, SIMILARITY), inside_slab()
-    request = {"convention": convention, "min_opacity": 0.1, "background_distance": 30.0}
-    z = picture_of(model, towards_slab(), DepthRequest(axis="z", **request)).depth
-    ray = picture_of(model, towards_slab(), DepthRequest(axis="ray", **request)).depth
-    assert z is not None
-    assert ray is not None
+    z, ray = z_and_distance(model, convention=convention, min_opacity=0.1, background_distance=30.0)
     assert pixels.sum() > 50
     expected = expected_z(convention, background_distance=30.0)
     # Each border is at most half a step off, and the background counts what passes at 30 units.
@@ -134,11 +138,7 @@ def test_depth_of_a_slab_in_closed_form_along_both_axes(convention):
 def test_z_of_a_plane_is_constant_and_its_ray_depth_is_not():
     # A thin wall at right angles to the optical axis.
     wall = foggy_cells((-1, -1, 0.0), (1, 1, 2 / SIDE))
-    request = {"convention": "conditional", "min_opacity": 0.0}
-    z = picture_of(fog(wall, SIMILARITY), towards_slab(), DepthRequest(axis="z", **request)).depth
-    ray = picture_of(fog(wall, SIMILARITY), towards_slab(), DepthRequest(axis="ray", **request)).depth
-    assert z is not None
-    assert ray is not None
+    z, ray = z_and_distance(fog(wall, SIMILARITY), convention="conditional", min_opacity=0.0)
     pixels = inside_slab()
     middle = NEAR + 1 / SIDE / SIMILARITY.scale
     np.testing.assert_allclose(z[pixels], middle, rtol=0.01)
@@ -149,11 +149,9 @@ def test_z_of_a_plane_is_constant_and_its_ray_depth_is_not():
 def test_depth_is_undefined_where_too_little_ray_termination():
     # Opacity of the slab is 1 - exp(-0.5 / cos) = 0.39 to 0.44: below one half, above one tenth.
     for convention, floor in (("conditional", 0.5), ("max-weight", 0.5), ("median", 0.0)):
-        depth = picture_of(fog(SLAB, SIMILARITY), towards_slab(), DepthRequest(convention, "z", floor)).depth
-        assert depth is not None
+        depth = present(picture_of(fog(SLAB, SIMILARITY), towards_slab(), DepthRequest(convention, "z", floor)).depth)
         assert np.isnan(depth[inside_slab()]).all()
-    moment = picture_of(fog(SLAB, SIMILARITY), towards_slab(), DepthRequest("moment", "z", 0.5)).depth
-    assert moment is not None
+    moment = present(picture_of(fog(SLAB, SIMILARITY), towards_slab(), DepthRequest("moment", "z", 0.5)).depth)
     assert np.isfinite(moment).all()
 
 
@@ -172,13 +170,11 @@ BARREL = Camera("OPENCV", 16, 12, (10.7, 10.7, 8.0, 6.0, -0.4, 0.0, 0.0, 0.0))
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_pixels_without_a_ray_have_no_depth_and_the_background(axis, convention):
     frame = Frame("barrel", BARREL, towards_slab().world_from_cam)
-    picture = picture_of(
-        fog(foggy_cells((-1, -1, -1), (1, 1, 1)), SIMILARITY), frame, DepthRequest(convention, axis, 0.0, 30.0)
-    )
+    model = fog(foggy_cells((-1, -1, -1), (1, 1, 1)), SIMILARITY)
+    picture = picture_of(model, frame, DepthRequest(convention, axis, 0.0, 30.0))
     invalid = ~picture.valid
     assert 4 <= invalid.sum() < 100
-    assert picture.depth is not None
-    assert np.isnan(picture.depth[invalid]).all()
+    assert np.isnan(present(picture.depth)[invalid]).all()
     assert (picture.opacity[invalid] == 0).all()
     assert (picture.rgb[invalid] == np.array(BACKGROUND, dtype=np.float32)).all()
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 from fog import fog, foggy_cells
+from present import present
 
 from nerfcli import atomic
 from nerfcli.cameras.camera import Camera
@@ -48,35 +49,32 @@ def foggy() -> Model:
 
 
 def job_of(count: int = 4, *, convention: str = "conditional", video: VideoSettings | None = VIDEO) -> RenderJob:
-    poses = [
-        look_at(np.array([0.1 * index, 0.0, -2.0]), np.zeros(3), np.array([0.0, -1.0, 0.0])) for index in range(count)
-    ]
+    up, middle = np.array([0.0, -1.0, 0.0]), np.zeros(3)
+    poses = [look_at(np.array([0.1 * index, 0.0, -2.0]), middle, up) for index in range(count)]
     frames = tuple(Frame(f"f{index}/v.png", Camera.pinhole(10, 8, 8.0), pose) for index, pose in enumerate(poses))
     depth = DepthRequest(convention, "z", min_opacity=0.1)
     return RenderJob(frames, RenderSettings(("rgb", "depth"), depth, video=video), {"run": "a run"})
 
 
-def reporting(on_frames: Callable[[float], None], *, notes: list[str] | None = None) -> Reporter:
-    """Return a reporter that is told how many of the frames are done, after each tile, which is a whole frame here."""
+def render(
+    model: Model, job: RenderJob, folder: Path, *, on_frames: Callable[[float], None] | None = None,
+    overwrite: bool = True, threads: int = 1,
+) -> list[float]:  # fmt: skip
+    """Render, and return how many of the frames were done after each tile, which is a whole frame here.
+
+    `on_frames` is told the same while it renders.
+    """
+    counts: list[float] = []
 
     def progress(fraction: float, detail: str) -> None:
         if detail:
-            on_frames(fraction * int(detail.split()[1]))
+            counts.append(fraction * int(detail.split()[1]))
+            if on_frames is not None:
+                on_frames(counts[-1])
 
-    return Reporter(note=([] if notes is None else notes).append, progress=progress)
-
-
-def render(
-    model: Model,
-    job: RenderJob,
-    folder: Path,
-    *,
-    on_frames: Callable[[float], None] = lambda done: None,
-    overwrite: bool = True,
-    threads: int = 1,
-) -> None:
     torch.set_num_threads(threads)
-    render_job(model, job, Output(folder, overwrite), reporter=reporting(on_frames))
+    render_job(model, job, Output(folder, overwrite), reporter=Reporter(progress=progress))
+    return counts
 
 
 def stop_after(frames: int, problem: BaseException) -> Callable[[float], None]:
@@ -117,8 +115,7 @@ def test_a_job_that_ends_early_goes_on_and_ends_the_same(model, tmp_path, in_one
     assert not folder.exists()
     (unfinished,) = tmp_path.glob(".views.unfinished-*")
     assert len(list(unfinished.rglob("v.tiff"))) == 2
-    done: list[float] = []
-    render(model, job_of(), folder, on_frames=done.append)
+    done = render(model, job_of(), folder)
     assert done == [2, 3, 4]  # existing frames are counted at once
     assert contents(folder) == in_one_go
     assert [path.name for path in tmp_path.iterdir()] == ["views"]
@@ -180,8 +177,7 @@ def test_another_job_takes_nothing_from_it_and_leaves_it(model, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         render(model, job_of(), tmp_path / "views", on_frames=stop_after(3, KeyboardInterrupt()))
     left = contents(tmp_path)
-    done: list[float] = []
-    render(model, job_of(convention="median"), tmp_path / "views", on_frames=done.append)
+    done = render(model, job_of(convention="median"), tmp_path / "views")
     assert done == [1, 2, 3, 4]
     assert json.loads((tmp_path / "views/render.json").read_text())["settings"]["depth"]["convention"] == "median"
     assert left.items() <= contents(tmp_path).items()
@@ -232,15 +228,13 @@ def test_parts_are_put_together_without_rendering(model, tmp_path, in_one_go):
         render_job(model, job_of(), Output(folder), part=part, reporter=Reporter(note=notes.append))
         assert not folder.exists()
     assert [text.split(" frames are ")[0] for text in notes] == ["1 of 4", "3 of 4", "resuming: 2 of 3", "4 of 4"]
-    done: list[float] = []
-    render(model, job_of(), folder, on_frames=done.append)
+    done = render(model, job_of(), folder)
     assert done == [4]
     assert contents(folder) == in_one_go
 
 
 def test_threads_leave_the_same_files(model, tmp_path, in_one_go):
-    done: list[float] = []
-    render(model, job_of(), tmp_path / "views", on_frames=done.append, threads=3)
+    done = render(model, job_of(), tmp_path / "views", threads=3)
     assert done == [1, 2, 3, 4]
     assert contents(tmp_path / "views") == in_one_go
     assert torch.get_num_threads() == 3
@@ -289,8 +283,7 @@ def test_other_videos_and_levels_of_a_finished_folder_are_made_without_rendering
     changed = replace(job_of(), settings=replace(job_of().settings, **changes))
     render(model, changed, tmp_path / "other")
     shutil.copytree(rendered, tmp_path / "views")
-    done: list[float] = []
-    render(model, changed, tmp_path / "views", on_frames=done.append)
+    done = render(model, changed, tmp_path / "views")
     assert done == [4]  # all at once, as they exist
     assert contents(tmp_path / "views") == contents(tmp_path / "other")
     assert not list(tmp_path.glob(".views*"))
@@ -302,12 +295,12 @@ def test_videos_that_others_were_to_replace_are_made_again(model, tmp_path, rend
     def interrupted(*given: Any, **options: Any) -> None:
         raise KeyboardInterrupt
 
-    folder, done = shutil.copytree(rendered, tmp_path / "views"), list[float]()
+    folder = shutil.copytree(rendered, tmp_path / "views")
     with monkeypatch.context() as patched:
         patched.setattr("nerfcli.render.presentation.write_video", interrupted)
         with pytest.raises(KeyboardInterrupt):
             render(model, job_of(video=VideoSettings(("mp4",))), folder)
-    render(model, job_of(), folder, overwrite=False, on_frames=done.append)
+    done = render(model, job_of(), folder, overwrite=False)
     assert done == [4]  # all at once, as they exist
     assert contents(folder) == contents(rendered)
 
@@ -317,9 +310,8 @@ def test_replacing_needs_overwrite_and_adding_does_not(model, tmp_path):
     render(model, job_of(video=None), folder, overwrite=False)
     before = contents(folder)
     render(model, job_of(), folder, overwrite=False)  # a video is added
-    assert {name for name in contents(folder) if before.get(name) != contents(folder)[name]} == {
-        *("rgb.gif", "depth.gif", "render.json")
-    }
+    written = {name for name in contents(folder) if before.get(name) != contents(folder)[name]}
+    assert written == {"rgb.gif", "depth.gif", "render.json"}
     before = contents(folder)
     render(model, job_of(), folder, overwrite=False, on_frames=stop_after(-1, AssertionError("a picture was rendered")))
     with pytest.raises(UserError, match="contains the same pictures with different videos") as caught:
@@ -333,8 +325,7 @@ def test_replacing_needs_overwrite_and_adding_does_not(model, tmp_path):
 def test_the_same_job_renders_again(model, tmp_path, rendered):
     """As --overwrite says."""
     shutil.copytree(rendered, tmp_path / "views")
-    done: list[float] = []
-    render(model, job_of(), tmp_path / "views", on_frames=done.append)
+    done = render(model, job_of(), tmp_path / "views")
     assert done == [1, 2, 3, 4]
 
 
@@ -356,8 +347,7 @@ def test_a_video_says_what_it_shows(model, tmp_path):
     render(model, job_of(video=replace(VIDEO, formats=("mp4", "gif"))), tmp_path / "views")
     description = json.loads((tmp_path / "views/render.json").read_text())
     for name in ("depth.mp4", "depth.gif"):
-        reported = description_of(tmp_path / "views" / name)
-        assert reported is not None
+        reported = present(description_of(tmp_path / "views" / name))
         assert (reported["convention"], reported["axis"], reported["unit"]) == ("conditional", "z", "arbitrary")
         assert reported["ranges"] == {"depth": description["ranges"]["depth"]}
         assert reported["run"] == "a run"
@@ -369,8 +359,7 @@ def test_a_video_names_a_run_whose_name_is_not_utf_8(model, tmp_path):
     job = replace(job_of(2, video=replace(VIDEO, formats=("mp4", "gif"))), provenance={"run": "caf\udce9"})
     render(model, job, tmp_path / "views")
     for name in ("depth.mp4", "depth.gif"):
-        reported = description_of(tmp_path / "views" / name)
-        assert reported is not None
+        reported = present(description_of(tmp_path / "views" / name))
         assert reported["run"] == "caf\udce9"
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import Browser, find_browser
+from browser import Browser, needs_browser
 from fog import fog, foggy_cells
 from markupsafe import escape
 
@@ -212,7 +212,7 @@ def test_photos_of_the_same_name_in_two_captures_stay_apart(seen):
     assert 'class="thumbnail"' not in page_html([facts(), facts()], [look, look], depths=[_meta()] * 2)
 
 
-@pytest.mark.skipif(find_browser() is None, reason="no browser")
+@needs_browser
 def test_captures_are_sorted_by_a_click(seen, tmp_path):
     (tmp_path / "page.html").write_text(two_captures(seen), encoding="utf-8")
     with Browser(tmp_path / "profile") as browser:

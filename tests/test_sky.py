@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from present import present
 from torch import Tensor
 
 from nerfcli.field.background import SphereBackground
@@ -35,9 +36,8 @@ def test_a_painted_background_has_the_colours_of_its_directions():
 
     def seen() -> tuple[Tensor, Tensor]:
         directions = torch.nn.functional.normalize(torch.randn(4096, 3, generator=generator), dim=-1)
-        return directions, torch.where(
-            directions[:, 2:] > 0, torch.tensor([0.2, 0.4, 0.9]), torch.tensor([0.5, 0.3, 0.1])
-        )
+        up, down = torch.tensor([0.2, 0.4, 0.9]), torch.tensor([0.5, 0.3, 0.1])
+        return directions, torch.where(directions[:, 2:] > 0, up, down)
 
     background = SphereBackground()
     paint(background, seen)
@@ -121,8 +121,7 @@ def test_the_gradient_of_roughness_moves_each_vertex_towards_its_neighbours():
     background.logits.data.zero_()
     background.logits.data[0, 1, 1, 1] = 1.0
     background.roughness().backward()
-    gradient = background.logits.grad
-    assert gradient is not None
+    gradient = present(background.logits.grad)
     assert float(gradient[0, 1, 1, 1]) == 2.0 * 6
     assert float(gradient[0, 1, 1, 2]) == -2.0
     assert float(gradient[0, 0, 0, 0]) == float(gradient[1, 1, 1, 1]) == 0.0

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from browser import Browser, find_browser
+from browser import Browser, needs_browser
 from page_arithmetic import array
 from PIL import Image
 
@@ -27,14 +27,8 @@ def balls() -> Gaussians:
 def page(tmp_path):
     notes: list[str] = []
     path = tmp_path / "a <b>.html"
-    write_splat_page(
-        *(path, balls()),
-        run=tmp_path / "<Balls> & more",
-        world_from_cam=WORLD_FROM_CAM,
-        fov_deg=FOV_DEG,
-        background=BACKGROUND,
-        notify=notes.append,
-    )
+    view = {"world_from_cam": WORLD_FROM_CAM, "fov_deg": FOV_DEG, "background": BACKGROUND}
+    write_splat_page(path, balls(), run=tmp_path / "<Balls> & more", **view, notify=notes.append)
     assert notes == []
     return path
 
@@ -49,11 +43,10 @@ def test_page_holds_splats_viewer_and_licence(page, tmp_path):
     np.testing.assert_allclose(means, balls().means, rtol=0, atol=np.exp(-2) / 32)  # of the size of the balls
 
 
+@needs_browser
 @pytest.mark.parametrize("size", [(640, 480), (520, 700)])
 def test_first_view_in_a_browser_without_a_network(page, tmp_path, size):
     """The middle of each ball is where the camera has it, in the colour that its harmonics have in that direction."""
-    if find_browser() is None:
-        pytest.skip("there is no Chromium on this machine to open the page with")
     flags = ("--host-resolver-rules=MAP * ~NOTFOUND",)
     with Browser(tmp_path / "profile", width=size[0], height=size[1], flags=flags) as browser:
         browser.open(page)
@@ -76,9 +69,8 @@ def test_first_view_in_a_browser_without_a_network(page, tmp_path, size):
     np.testing.assert_allclose(picture[5, 5], BACKGROUND, rtol=0, atol=1 / 255)
 
 
+@needs_browser
 def test_a_browser_without_webgl_is_told(page, tmp_path):
-    if find_browser() is None:
-        pytest.skip("there is no Chromium on this machine to open the page with")
     with Browser(tmp_path / "profile", flags=("--disable-3d-apis",)) as browser:
         browser.open(page)
         assert "cannot show the splats: Error: WebGL not supported" in browser.run("document.body.innerText")

@@ -108,9 +108,8 @@ def test_pictures_of_the_field_add_what_no_photo_shows_in_their_own_brightness()
     np.testing.assert_array_equal(result.log_gains, alone.log_gains)  # one photo, so one gain
     assert result.log_gains.shape == (1, 3)
     # The photo looks along -x: the face at x = -1/2 is behind the box.
-    behind = [
-        begun_with.gaussians.moved(TRAINING_FROM_SCENE).means[:, 0] < -HALF + 0.01 for begun_with in (alone, result)
-    ]
+    means = [begun_with.gaussians.moved(TRAINING_FROM_SCENE).means for begun_with in (alone, result)]
+    behind = [places[:, 0] < -HALF + 0.01 for places in means]
     assert behind[0].sum() == 0
     assert behind[1].sum() > 20
     # The photo's gain takes its 0.6 to the field's 0.5; the pictures are 0.5 as they are.

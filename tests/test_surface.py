@@ -54,6 +54,11 @@ def ball_view(place: np.ndarray, *, camera: Camera = CAMERA, name: str = "a.png"
     )
 
 
+def around(reach: float, voxel_size: float) -> Grid:
+    """Return the voxels within a distance of the ball's centre along each axis."""
+    return Grid.over((*(CENTRE - reach), *(CENTRE + reach)), voxel_size)
+
+
 def places_around(count: int, distance: float = 2.0) -> np.ndarray:
     """Places on a sphere around the ball, evenly spread (Fibonacci)."""
     z = 1 - 2 * (np.arange(count) + 0.5) / count
@@ -69,8 +74,7 @@ def ball_views() -> list[DepthView]:
 
 @pytest.fixture(scope="module")
 def fused(ball_views) -> FusedVolume:
-    low, high = CENTRE - 0.7, CENTRE + 0.7
-    return fuse(ball_views, Grid.over((*low, *high), 0.025))
+    return fuse(ball_views, around(0.7, 0.025))
 
 
 # Depth maps to surfaces
@@ -105,9 +109,8 @@ def test_a_panorama_shows_the_surfaces_all_around():
 def test_normals_of_a_plane_are_its_own():
     normal = np.array([0.3, -0.2, -1.0])
     depth = (2.0 / -(plane_rays(CAMERA) @ normal)).astype(np.float32)
-    np.testing.assert_allclose(
-        normals_of(depth, CAMERA), np.broadcast_to(normal / np.linalg.norm(normal), (90, 120, 3)), atol=2e-4
-    )
+    expected = np.broadcast_to(normal / np.linalg.norm(normal), (90, 120, 3))
+    np.testing.assert_allclose(normals_of(depth, CAMERA), expected, atol=2e-4)
     hole = depth.copy()
     hole[40:50, 40:50] = np.nan
     assert np.isnan(normals_of(hole, CAMERA)).all(-1).sum() == 100
@@ -137,7 +140,7 @@ def test_the_mesh_of_a_ball_has_no_gap_between_blocks_and_bricks(fused):
 def test_what_no_photo_sees_is_not_closed():
     """One side of the ball is seen: the mesh ends with it, and no face reaches the side that was not seen."""
     views = [ball_view(CENTRE + np.array([2.0, 0.1 * step, 0.05])) for step in range(3)]
-    mesh = surface_of(fuse(views, Grid.over((*(CENTRE - 0.7), *(CENTRE + 0.7)), 0.025)))
+    mesh = surface_of(fuse(views, around(0.7, 0.025)))
     off = np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS
     assert np.abs(off).max() < 0.025
     assert (mesh.vertices[:, 0] - CENTRE[0]).min() > -0.05
@@ -153,20 +156,16 @@ def test_the_order_of_the_photos_changes_the_last_digits_alone(ball_views, fused
 def test_rays_that_meet_nothing_clear_what_stands_in_them(ball_views):
     """A floater that one photo sees, in space that others see to be free."""
     wrong = ball_views[0]
-    depth = wrong.depth.copy()
-    depth[:12, :12] = 1.4
-    opacity = wrong.opacity.copy()
-    opacity[:12, :12] = 1.0
-    floating = DepthView(
-        wrong.frame, wrong.rgb, opacity, depth, np.where(np.isfinite(depth), np.float32(1e-4), np.float32(np.nan)),
-        wrong.disagreement, normals_of(depth, CAMERA),
-    )  # fmt: skip
-    mesh = surface_of(fuse([floating, *ball_views[1:]], Grid.over((*(CENTRE - 1.2), *(CENTRE + 1.2)), 0.03)))
+    depth, opacity = wrong.depth.copy(), wrong.opacity.copy()
+    depth[:12, :12], opacity[:12, :12] = 1.4, 1.0
+    spread = np.where(np.isfinite(depth), np.float32(1e-4), np.float32(np.nan))
+    floating = replace(wrong, opacity=opacity, depth=depth, spread=spread, normals=normals_of(depth, CAMERA))
+    mesh = surface_of(fuse([floating, *ball_views[1:]], around(1.2, 0.03)))
     assert np.linalg.norm(mesh.vertices - CENTRE, axis=1).max() < RADIUS + 0.03
 
 
 def test_points_of_a_ball_are_on_it_and_say_how_well_they_are_seen(ball_views):
-    grid = Grid.over((*(CENTRE - 0.7), *(CENTRE + 0.7)), 0.05)
+    grid = around(0.7, 0.05)
     points = agreed_points(ball_views, grid)
     off = np.linalg.norm(points.places - CENTRE, axis=1) - RADIUS
     assert np.abs(off).max() < 1e-5
@@ -193,8 +192,7 @@ def facing(centre: np.ndarray, point: np.ndarray) -> float:
 
 
 def test_a_point_that_one_photo_alone_sees_is_left_out(ball_views):
-    grid = Grid.over((*(CENTRE - 0.7), *(CENTRE + 0.7)), 0.05)
-    assert len(agreed_points(ball_views[:1], grid).places) == 0
+    assert len(agreed_points(ball_views[:1], around(0.7, 0.05)).places) == 0
 
 
 def test_fewer_faces_are_about_the_same_ball(fused):
@@ -209,10 +207,8 @@ def test_fewer_faces_are_about_the_same_ball(fused):
 def test_small_pieces_are_left_out(fused):
     mesh = surface_of(fused)
     speck = np.array([[9.0, 9, 9], [9, 9, 9.1], [9, 9.1, 9]])
-    both = mesh_of(
-        np.concatenate([mesh.vertices, speck]),
-        np.concatenate([mesh.faces, [[len(mesh.vertices) + i for i in range(3)]]]),
-    )
+    faces = np.concatenate([mesh.faces, len(mesh.vertices) + np.arange(3)[None]])
+    both = mesh_of(np.concatenate([mesh.vertices, speck]), faces)
     kept = without_small_pieces(both)
     assert len(kept.faces) == len(mesh.faces)
     assert np.abs(kept.vertices).max() < 9
@@ -327,17 +323,15 @@ def test_undistorted_photos_have_straight_lines_and_half_pixels():
 # The command
 
 
-def small(scale: float, voxel: float) -> tuple[str, ...]:
-    """Options for quick work: voxels in units of the training frame, and small pictures."""
-    return "--voxel-size", f"{voxel / scale:.9g}"
+def voxels(run: Path, size: float) -> tuple[str, str]:
+    """Return the option for voxels of a size in units of the training frame."""
+    return "--voxel-size", f"{size / Run(run).model().training_from_scene.scale:.9g}"
 
 
 @pytest.fixture
 def blocked(finished: Path) -> Path:
     """A run of six views whose field is a block, dense from its surface on."""
-    given = Run(finished).model()
-    model = block(given.training_from_scene, unit="metre")
-    save_model(finished / FIELD, model)
+    save_model(finished / FIELD, block(Run(finished).model().training_from_scene))
     return finished
 
 
@@ -347,9 +341,8 @@ def sides_of(run: Path, points: np.ndarray) -> np.ndarray:
 
 
 def test_a_mesh_is_written_in_the_frame_of_the_scene(blocked, tmp_path):
-    scale = Run(blocked).model().training_from_scene.scale
     for form in ("ply", "glb", "obj"):
-        result = completed("export", blocked, "--to", "mesh", *small(scale, 0.06), "-o", tmp_path / f"a.{form}")
+        result = completed("export", blocked, "--to", "mesh", *voxels(blocked, 0.06), "-o", tmp_path / f"a.{form}")
         assert result.stdout.strip() == str(tmp_path / f"a.{form}")
     vertices, _ = vertices_of(tmp_path / "a.ply")
     assert len(vertices) > 200
@@ -374,8 +367,7 @@ def vertices_of(path: Path) -> tuple[np.ndarray, int]:
 
 
 def test_points_are_written(blocked, tmp_path):
-    scale = Run(blocked).model().training_from_scene.scale
-    completed("export", blocked, "--to", "points", *small(scale, 0.05), "-o", tmp_path / "p.ply")
+    completed("export", blocked, "--to", "points", *voxels(blocked, 0.05), "-o", tmp_path / "p.ply")
     places, _ = vertices_of(tmp_path / "p.ply")
     assert np.abs(sides_of(blocked, places) - 0.5).max() < 0.02
     facts = describe(tmp_path / "p.ply")
@@ -398,9 +390,9 @@ def test_what_cannot_be_exported_is_refused_in_two_lines(blocked, tmp_path):
 
 
 def test_exports_stand_beside_the_run_under_its_name(blocked):
-    scale = Run(blocked).model().training_from_scene.scale
-    result = completed("export", blocked, "--to", "points", "--quiet", *small(scale, 0.25))
+    _, size = voxels(blocked, 0.25)
+    result = completed("export", blocked, "--to", "points", "--quiet", "--voxel-size", size)
     assert result.stderr == ""
     assert Path(result.stdout.strip()) == blocked.with_name("spheres-run-points.ply")
-    size = SurfaceSettings(voxel_size=0.25 / scale, max_size=48)
-    assert export_run(blocked, to="mesh", settings=size) == blocked.with_name("spheres-run-mesh.ply")
+    settings = SurfaceSettings(voxel_size=float(size), max_size=48)
+    assert export_run(blocked, to="mesh", settings=settings) == blocked.with_name("spheres-run-mesh.ply")

@@ -22,9 +22,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from browser import Browser, find_browser
+from browser import Browser, needs_browser
 from commands import error_of, nerfcli, started
 from fog import foggy_cells
+from present import present
+from trainings import FEW
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -39,7 +41,6 @@ from nerfcli.render.trained_field import Marching
 from nerfcli.training import loop
 from nerfcli.training.runs.files import FIELD
 from nerfcli.training.runs.run import Run
-from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.viewer import painter
 from nerfcli.viewer.packing import PackedField, pack_model
 from nerfcli.viewer.painter import Painter, Tile, View, render_tile, strides_of, tiles_of, view_from_json
@@ -47,9 +48,7 @@ from nerfcli.viewer.pictures import view_of
 from nerfcli.viewer.server import Address, PageServer
 from nerfcli.workflows.view import RunData, view_run
 
-FEW = TrainSettings(
-    budget_seconds=None, steps=12, samples_per_step=2**10, log2_rows=10, threads=2, downscale=8, model="default"
-)
+SHORT = replace(FEW, downscale=8, model="default")
 
 
 class Served:
@@ -135,18 +134,15 @@ def rendered(model: Model, frame: Frame, depth: str) -> RenderedPicture:
 def test_a_picture_is_that_of_nerfcli_render_bit_for_bit(trained):
     frame, model = frame_of(trained.show._path), Run(trained.show._path).model()
     picture = assembled(trained.get("picture", view_request(frame)), frame)
-    by_render = {
-        name: rendered(model, frame, name) for name in ("conditional", "median", "max-weight", "quantile:0.25")
-    }
+    columns = {"conditional": 4, "median": 6, "max-weight": 7, "quantile:0.25": 10}
+    by_render = {name: rendered(model, frame, name) for name in columns}
     first = by_render["conditional"]
     np.testing.assert_array_equal(picture[..., :3], first.rgb)
     np.testing.assert_array_equal(picture[..., 3], first.opacity)
     assert first.opacity.std() > 0.2
-    columns = {"conditional": 4, "median": 6, "max-weight": 7, "quantile:0.25": 10}
     scale = model.training_from_scene.scale
     for name, column in columns.items():
-        expected = by_render[name].depth
-        assert expected is not None
+        expected = present(by_render[name].depth)
         ours = np.where(picture[..., column] < 0, np.nan, picture[..., column] / scale)
         np.testing.assert_allclose(ours, expected, rtol=1e-6)
 
@@ -156,9 +152,8 @@ def test_a_coarse_picture_has_the_rays_of_the_middles_of_its_pixels(spheres_run)
     view = View(frame, 0.25)
     coarse = render_tile(model, view, Tile(4, 0, 0, 13, 9))
     focal, _, cx, cy = frame.camera.params
-    moved = Frame(
-        "middle", Camera("PINHOLE", 1, 1, (focal, focal, cx - (4 * 5 + 1.5), cy - (4 * 3 + 1.5))), frame.world_from_cam
-    )
+    pixel = Camera("PINHOLE", 1, 1, (focal, focal, cx - (4 * 5 + 1.5), cy - (4 * 3 + 1.5)))
+    moved = Frame("middle", pixel, frame.world_from_cam)
     one = render_tile(model, View(moved, 0.25), Tile(1, 0, 0, 1, 1))
     np.testing.assert_allclose(coarse[3, 5, :4], one[0, 0, :4], atol=2e-4)
 
@@ -382,8 +377,7 @@ def test_an_address_of_another_machine_is_refused(finished):
 
 def test_ctrl_c_ends_the_server(finished):
     process = started("view", finished, "--no-browser")
-    assert process.stdout is not None
-    url = process.stdout.readline().strip()
+    url = present(process.stdout).readline().strip()
     with urllib.request.urlopen(url + "version", timeout=60) as answer:
         assert answer.read() == b"1"
     process.send_signal(signal.SIGINT)
@@ -397,9 +391,8 @@ def test_ctrl_c_ends_the_server(finished):
 
 
 def fit(run: Path, *, on_step: Any = lambda progress: None) -> None:
-    loop.train(
-        load_scene(run.with_name("spheres")), run, FEW, resume=False, notify=lambda text: None, on_progress=on_step
-    )
+    scene = load_scene(run.with_name("spheres"))
+    loop.train(scene, run, SHORT, resume=False, notify=lambda text: None, on_progress=on_step)
 
 
 def test_the_page_waits_for_a_field_in_a_folder_whose_name_is_not_utf_8(tmp_path):
@@ -435,18 +428,16 @@ def test_each_checkpoint_is_a_new_version_and_viewers_change_nothing(capture, mo
 # In a browser
 
 
+@needs_browser
 def test_a_browser_without_a_graphics_card_shows_what_the_server_renders(trained, tmp_path):
-    if find_browser() is None:
-        pytest.skip("there is no Chromium on this machine to open the page with")
     with Browser(tmp_path, width=860, height=480) as browser:
         browser.visit(trained.url)
         assert browser.run("document.getElementById('by').value") == "server"
         browser.wait("document.body.dataset.rested > 0")
         assert not browser.errors
         view = browser.run("nerfcliPage.view()")
-        found = np.array(browser.run("[...nerfcliPage.renderer.layers.at(-1).colour]")).reshape(
-            view["height"], view["width"], 4
-        )
+        drawn_colours = np.array(browser.run("[...nerfcliPage.renderer.layers.at(-1).colour]"))
+        found = drawn_colours.reshape(view["height"], view["width"], 4)
         frame = view_from_json(view).frame
         model = Run(trained.show._path).model()
         by_render = rendered(model, frame, "median")
@@ -476,18 +467,15 @@ def test_a_browser_without_a_graphics_card_shows_what_the_server_renders(trained
         assert not browser.errors
 
 
+@needs_browser
 def test_a_browser_draws_each_new_field_by_itself(finished, tmp_path):
-    if find_browser() is None:
-        pytest.skip("there is no Chromium on this machine to open the page with")
     old = Run(finished).model()
     with closing(Served(finished)) as served, Browser(tmp_path, width=420, height=200) as browser:
         browser.visit(served.url + "?by=page")
         browser.wait("document.body.dataset.rested > 0")
         assert browser.run("nerfcliPage.probe.colour.slice(0, 3)") == {"0": 1, "1": 1, "2": 1}
-        save_model(
-            finished / FIELD,
-            replace(old, background=(0.0, 0.5, 1.0), occupied=foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.0))),
-        )
+        half = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.0))
+        save_model(finished / FIELD, replace(old, background=(0.0, 0.5, 1.0), occupied=half))
         browser.run("nerfcliPage.check()")  # before the page has asked for a newer field
         found = json.loads(browser.run("document.getElementById('checked').dataset.found"))
         assert found["colour"]["largest"] < 2e-3
