@@ -75,7 +75,8 @@ def run_worker(
         overdue.check = guard.check["check"]
         raise overdue
     if guard.reached == "memory":
-        error = _too_large(memory_bytes, stage)
+        assert memory_bytes is not None
+        error = _out_of_memory(f"was stopped while {stage}: it needed more than {memory_bytes / 1e9:.3g} GB of memory")
     else:
         free_bytes = shutil.disk_usage(job_path.parent).free
         error = explain_death(worker.returncode, stage, log.read_text(encoding="utf-8", errors="replace"), free_bytes)
@@ -92,19 +93,13 @@ def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> Use
     # With less free space, SQLite and pycolmap cannot write the next part.
     if free_bytes < 2_000_000 or "disk is full" in log or os.strerror(ENOSPC) in log:
         return UserError(
-            f"structure from motion stopped while {stage}: the disk is full ({free_bytes / 1000000.0:.1f} MB free)",
+            f"structure from motion stopped while {stage}: the disk is full ({free_bytes / 1e6:.1f} MB free)",
             f"free some disk space, or choose another disk with -o; {_GO_ON}",
         )
     if returncode == -9:  # SIGKILL, which Python's signals on Windows lack
-        return WorkerDiedError(
-            f"structure from motion was killed while {stage}, most likely because memory ran out",
-            f"{_LESS_MEMORY}; {_GO_ON}",
-            OUT_OF_MEMORY,
-        )
+        return _out_of_memory(f"was killed while {stage}, most likely because memory ran out")
     if "bad_alloc" in log or "MemoryError" in log:
-        return WorkerDiedError(
-            f"structure from motion ran out of memory while {stage}", f"{_LESS_MEMORY}; {_GO_ON}", OUT_OF_MEMORY
-        )
+        return _out_of_memory(f"ran out of memory while {stage}")
     how = signal.Signals(-returncode).name if returncode < 0 else f"exit status {returncode}"
     return WorkerDiedError(
         f"structure from motion crashed ({how}) while {stage}: {_last_words(log)}",
@@ -148,13 +143,8 @@ class _Guard:
         return most is not None and time.monotonic() - self._check_seen > most
 
 
-def _too_large(memory_bytes: int | None, stage: str) -> UserError:
-    assert memory_bytes is not None
-    return WorkerDiedError(
-        f"structure from motion was stopped while {stage}: it needed more than {memory_bytes / 1e9:.3g} GB of memory",
-        f"{_LESS_MEMORY}; {_GO_ON}",
-        OUT_OF_MEMORY,
-    )
+def _out_of_memory(how: str) -> WorkerDiedError:
+    return WorkerDiedError(f"structure from motion {how}", f"{_LESS_MEMORY}; {_GO_ON}", OUT_OF_MEMORY)
 
 
 def _last_words(log: str) -> str:
