@@ -24,9 +24,7 @@ NOT_COMPARABLE = ("masks",)
 class Variant:
     """A model that is compared with the chosen one.
 
-    Args:
-        name: name of its row and its folders.
-        adds: True if it has one component more than the chosen model, False for one less; None for the chosen model.
+    adds: True if it has one component more than the chosen model, False for one less; None for the chosen model.
     """
 
     name: str
@@ -53,7 +51,6 @@ def variants(chosen: Components, capture: CaptureTraits, *, only: tuple[str, ...
     """Return models with one component removed from the chosen one, or added to it, in the order of `CHOICES`.
 
     Args:
-        chosen: the model that all are compared with.
         capture: decides which components can be tried.
         only: names of components; all if empty.
     """
@@ -194,11 +191,7 @@ def _verdict(variant: Variant, difference: float | None, half: float | None) -> 
 def write_results(
     folder: Path, rows: Sequence[ResultRow], measured: Sequence[MeasuredTraining], about: dict[str, Any]
 ) -> None:
-    """Write FOLDER/ablation.json and ablation.csv.
-
-    Args:
-        about: description of the ablation's subject, as plain values.
-    """
+    """Write FOLDER/ablation.json and ablation.csv; `about` describes the ablation's subject, as plain values."""
     content = {
         "format": FORMAT,
         **about,
@@ -213,11 +206,7 @@ def write_results(
 
 
 def refuse_others(output: Output, folder: Path, about: dict[str, Any]) -> None:
-    """Raise if the folder contains something other than an ablation, or one with results that this one would drop.
-
-    Args:
-        about: description of this ablation, as for `write_results`.
-    """
+    """Raise if the folder contains something other than an ablation, or one with results that this one would drop."""
     result = folder / RESULT
     others = folder.is_dir() and any(entry.name != RUNS for entry in folder.iterdir())
     if folder.is_file() or (others and not result.exists()):

@@ -122,15 +122,14 @@ def train_settings() -> list[TrainSetting]:
 def affordable(
     settings: Sequence[TrainSetting], seconds: float, *, overhead: float
 ) -> tuple[list[TrainSetting], float]:
-    """Return as many of the first settings as time allows, and the time for one unit of training.
+    """Return as many of the first settings as time allows, and the seconds of a training with a fraction of 1.
+
+    These are at least `SHORTEST_TRAINING_SECONDS` if there are two settings or more.
 
     Args:
         settings: the most informative first; at least one.
         seconds: time limit for all.
         overhead: seconds that each takes besides its training.
-
-    Returns:
-        The settings, and seconds for a fraction of 1: at least `SHORTEST_TRAINING_SECONDS` if there are two or more.
     """
     fractions = accumulate(setting.fraction for setting in settings)
     units = [(seconds - overhead * count) / total for count, total in enumerate(fractions, start=1)]

@@ -86,8 +86,7 @@ def table_of(points: Sequence[Point]) -> list[tuple[str, ...]]:
 def write_results(folder: Path, about: Mapping[str, Any], points: Sequence[Point], *, complete: bool) -> dict[str, Any]:
     """Write bench.csv, bench.png and, last, bench.json, each atomically; return the content of bench.json.
 
-    Args:
-        about: what was measured, and where.
+    `about` is what was measured, and where.
 
     Raises:
         UserError: a file cannot be written.

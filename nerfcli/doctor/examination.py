@@ -50,7 +50,6 @@ class Diagnosis:
     Args:
         findings: results of the checks that were made, in order.
         not_checked: (name, reason) of the checks that were not made.
-        photos: the readable photos.
         missing_detail: (photos,) log2 of the detail that each photo lacks relative to the others; NaN without texture.
         exposure_stops: (photos,) stops by which each shows the same points brighter than the median photo; NaN where
             unknown.

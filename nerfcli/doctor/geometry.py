@@ -62,10 +62,7 @@ def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding
 
 
 def baselines(count: int, pairs: Sequence[Pair]) -> np.ndarray:
-    """Return the largest baseline over depth of each photo to another, or the second largest of three or more.
-
-    (count,); NaN for photos without a usable pair.
-    """
+    """Return each photo's largest baseline over depth, of three or more the second largest, (count,); NaN for none."""
     found: list[list[float]] = [[] for _ in range(count)]
     for pair in pairs:
         if pair.views is not None:
@@ -145,10 +142,7 @@ def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Findi
 
 
 def turning_object(pairs: Sequence[Pair]) -> Finding | None:
-    """Return a finding if an object turns in front of a static background, else None.
-
-    In such a capture the camera stood still, so the other checks of movement between pairs do not apply.
-    """
+    """Return a finding if an object turns before a static background, where other checks of movement do not apply."""
     motions = together([pair.motions for pair in pairs if pair.motions is not None])
     others = sum(pair.linked and pair.motions is None for pair in pairs)
     motions = replace(motions, moved=motions.moved + others)

@@ -104,7 +104,6 @@ class PhotoFacts:
         digest: SHA-256 of the file.
         thumbnail: a small JPEG.
         tiny: (32, 32) float32 grey picture with mean 0 and norm 1; all 0 for a uniform one.
-        is_panorama: whether it shows the whole sphere.
     """
 
     name: str

@@ -185,12 +185,9 @@ def reduction(frame: Frame) -> float:
 
 
 class GeometryComparison:
-    """Compares a field with billboards, photo by photo.
+    """Compares a field with billboards, fitted to the training photos, photo by photo.
 
     A comparison that fails does not stop the evaluation: `failure` then gives the reason, and there is no shape.
-
-    Args:
-        billboards: fitted to the training photos.
     """
 
     def __init__(self, billboards: Billboards):

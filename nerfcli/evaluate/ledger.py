@@ -21,11 +21,7 @@ class Entry:
 
 
 def leak_ledger(config: RunConfig) -> list[Entry]:
-    """Return the ledger of a run.
-
-    `config.history` is the provenance of the scene: {"command": "poses", ...} where `nerfcli poses` found the
-    cameras.
-    """
+    """Return the ledger of a run, by the provenance of its scene, `config.history`, which `nerfcli poses` writes."""
     return [
         *_cameras(config.history, str(config.scene_kind), config.holdout),
         Entry(

@@ -82,12 +82,7 @@ def compare(rendered: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> Met
 def compare_fully(
     rendered: np.ndarray, photo: np.ndarray, *, used: np.ndarray, perceptual: "Perceptual | None", align: bool
 ) -> Metrics:
-    """Compare a picture with a photo by all metrics.
-
-    Args:
-        rendered, photo, used: pictures, see `compare`.
-        align: whether colours may be aligned to those of the photo.
-    """
+    """Compare a picture with a photo by all metrics; `align`: whether its colours may be aligned. See `compare`."""
     found = replace(
         compare(rendered, photo, used=used),
         lpips=_lpips(to_8_bit(rendered), photo, used=used, perceptual=perceptual),
@@ -114,12 +109,7 @@ def as_float(picture: np.ndarray) -> np.ndarray:
 
 
 def psnr(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float:
-    """Return the peak signal-to-noise ratio in dB over the pixels that count and their channels, see `psnr_of`.
-
-    Args:
-        picture, photo: (H, W, 3) uint8, or float in [0, 1].
-        used: (H, W) bool, the pixels that count; at least one.
-    """
+    """Return the PSNR in dB of pictures (H, W, 3), uint8 or float in [0, 1], over `used` pixels (H, W): `psnr_of`."""
     return psnr_of(float(np.square(as_float(picture[used]) - as_float(photo[used])).mean()))
 
 

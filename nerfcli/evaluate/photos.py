@@ -107,7 +107,6 @@ def held_out_photos(run: Run, frames: Sequence[Frame], *, left_out_by: Run | Non
     """Load held-out photos of a run as for its training, each with its gains, from EXIF or from its neighbours.
 
     Args:
-        frames: with their images and masks.
         left_out_by: a run whose pixels that were left out do not count, instead of those of this run.
 
     Raises:
@@ -153,12 +152,9 @@ KINDS = ("png", "float")
 
 
 def save_compared(folder: Path, stem: str, compared: ComparedImages, *, kind: str) -> None:
-    """Write the 8-bit picture, the photo and, where pixels are left out, the mask.
+    """Write the 8-bit picture, the photo and, where pixels are left out, the mask, in folders of predictions.
 
-    Args:
-        folder: the folder of predictions.
-        stem: the name of the files, without suffix; subfolders are created.
-        kind: one of `KINDS`.
+    `stem` is the name of the files and may have subfolders; `kind` is one of `KINDS`.
     """
     write_png(folder / "color" / f"{stem}.png", to_8_bit(compared.rendered))
     write_png(folder / "gt-color" / f"{stem}.png", compared.photo)

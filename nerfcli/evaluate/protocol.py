@@ -250,11 +250,7 @@ def evaluate_model(
     on_image: Callable[[int, int], None],
     extras: Extras = Extras(),
 ) -> RunMetrics:
-    """Compare the model with every held-out photo.
-
-    Args:
-        held_out: the photos, at least one.
-        on_image: called with (rays done, total rays).
+    """Compare the model with every held-out photo; `on_image` receives (rays done, total rays).
 
     Raises:
         UserError: nothing was held out, or a mask hides a whole photo.

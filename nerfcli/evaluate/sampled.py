@@ -25,9 +25,7 @@ _RAYS = 4096
 class SampledPixels:
     """Random pixels of held-out photos, equally many of each, and the same for every field that is measured.
 
-    Args:
-        photos: the held-out photos of which masks leave something.
-        pixels: for each photo, the indices of its pixels, counted row by row.
+    photos: those of which masks leave something. pixels: for each, the indices of its pixels, counted row by row.
     """
 
     photos: tuple[HeldOutPhoto, ...]

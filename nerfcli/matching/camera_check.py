@@ -34,7 +34,6 @@ class CameraCheck:
         log_focal: logarithm of the factor by which all focal lengths should be multiplied.
         error: its standard error; infinite where the best factor is at the end of the search range.
         misses_px: median distances of features from their epipolar lines, without and with the factor.
-        matches: number of matches.
     """
 
     log_focal: float

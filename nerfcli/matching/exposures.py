@@ -20,8 +20,8 @@ FEWEST_PIXELS = 50
 def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]) -> np.ndarray:
     """Estimate the logarithms (P, 3) of the gains of photos in linear light, per channel, with mean 0.
 
-    The log ratio of a pair is the median over its common pixels. Differences between log gains fit these log ratios by
-    least absolute errors. NaN for photos that share too little with the others to be compared.
+    They fit the log ratios of pairs, medians over their common pixels, by least absolute errors. NaN for photos that
+    share too little with the others to be compared.
     """
     levels = [np.ascontiguousarray(photo.pixels[..., :3]) for photo in photos]
     # Averaged, so that misalignments by a pixel hardly matter.

@@ -40,11 +40,9 @@ class Matches:
 
 
 def find_features(grey: np.ndarray, *, longer_side_px: int, most: int, used: np.ndarray | None = None) -> Features:
-    """Find SIFT features in a grey photo (H, W), reduced until its longer side is at most `longer_side_px`.
+    """Find SIFT features in a grey photo (H, W) uint8, reduced until its longer side is at most `longer_side_px`.
 
     Args:
-        grey: uint8.
-        longer_side_px: smaller photos are not enlarged.
         most: number of features to keep, by contrast; a few more at equal contrast.
         used: (H, W) bool, where to look for features; None for everywhere.
     """

@@ -99,10 +99,9 @@ def potentials(
     trust: np.ndarray,
     usual_error: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate a number v per photo such that v_j - v_i fits the differences (weighted least absolute deviations), as
-    heights are found in a levelling survey.
+    """Estimate a number v per photo such that v_j - v_i fits the differences, as heights in a levelling survey.
 
-    In each connected group of photos v is determined up to a constant, which makes its median 0.
+    Weighted least absolute deviations; a constant of each connected group of photos makes its median 0.
 
     Args:
         pairs: (i, j) of each difference.

@@ -41,10 +41,7 @@ class PlainBackground:
 
 
 def plain_background(photos: Sequence[LoadedPhoto]) -> PlainBackground | None:
-    """Return the background that all photos have; None if there is none.
-
-    None for photos with alpha or with masks, which say themselves what is background, and for panoramas.
-    """
+    """Return the background that all photos have; None without one, for panoramas, and if there is alpha or a mask."""
     if any(
         photo.pixels.shape[-1] == 4 or photo.used is not None or photo.frame.camera.is_spherical for photo in photos
     ):

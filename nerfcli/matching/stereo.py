@@ -74,7 +74,6 @@ def dense_depths(
     Args:
         tracks: sparse points, which determine the neighbours and the range of depths.
         longer_side_px: longer side of the pictures that are matched.
-        threads: number of photos processed at a time.
 
     Returns:
         One entry per photo, without pixels where nothing is known.

@@ -146,15 +146,10 @@ class Faces:
         return slice(self.first[number], self.first[number] + count)
 
     def joined(self, number: int, pixels: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Find the pixels of an original photo that show the same as some pixels of its faces.
+        """Find the pixels (M, 2) int64 of an original photo that show the same as some pixels of its faces, each once.
 
-        Args:
-            number: of the photo.
-            pixels: (N_i, 2) int64 column and row in each of its faces.
-
-        Returns:
-            pixels (M, 2) int64 of the photo, each once; index (M,) of each in the pixels of all faces, one face after
-            another: where two faces show it, that of the first of them.
+        `pixels` are (N_i, 2) int64 columns and rows in each face. Also returns the index (M,) of each in the pixels of
+        all faces, one face after another: where two faces show it, that of the first of them.
         """
         camera = self.originals[number].frame.camera
         if not camera.is_spherical:

@@ -52,11 +52,7 @@ def write_png(figure: "Figure", path: Path) -> None:
 
 
 def svg(figure: "Figure", *, width: str = "100%") -> Markup:
-    """Return a figure as an SVG element; what has the gid "title: TEXT" shows TEXT when pointed at.
-
-    Args:
-        width: of the element, in CSS.
-    """
+    """Return a figure as an SVG element, `width` in CSS; what has the gid "title: TEXT" shows TEXT when pointed at."""
     from matplotlib import rc_context
 
     written = io.StringIO()

@@ -32,12 +32,7 @@ FROM_ITS_SERVER = {"img-src": "data: 'self'", "connect-src": "'self'"}
 
 @dataclass(frozen=True)
 class Mark:
-    """Mark of a page's source, which does not reveal its path.
-
-    Args:
-        kind: the command that wrote it.
-        source: the folder that it is about.
-    """
+    """Mark of a page of a kind, the command that wrote it, about a source folder, whose path it does not reveal."""
 
     kind: str
     source: Path
@@ -170,10 +165,7 @@ def _origin_html(origin: str) -> str:
 def claim_page(output: Output, path: Path, mark: Mark, *, about: str) -> None:
     """Raise an error if a page cannot be written to a path, or a file there must not be replaced.
 
-    Pages with the same mark may always be replaced.
-
-    Args:
-        about: the subject of such a page, for the message: "capture".
+    Pages with the same mark may always be replaced. `about` is their subject, for the message: "capture".
 
     Raises:
         UserError: the path is a folder, cannot be written, or holds something else.
@@ -206,21 +198,12 @@ JPEG_QUALITY = 85
 
 
 def data_uri(data: bytes, kind: str) -> str:
-    """Return an encoded picture as a data URI.
-
-    Args:
-        kind: jpeg or png.
-    """
+    """Return an encoded picture, of kind jpeg or png, as a data URI."""
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
 def jpeg_bytes(picture: np.ndarray, *, longest_px: int | None = None, quality: int = JPEG_QUALITY) -> bytes:
-    """Encode a photo or a rendering as JPEG.
-
-    Args:
-        picture: (H, W, 3) uint8 sRGB.
-        longest_px: limit of its longer side; smaller pictures are not scaled. None for no limit.
-    """
+    """Encode a picture (H, W, 3) uint8 sRGB as JPEG, reduced if its longer side exceeds `longest_px`."""
     return _encoded(fitted(picture, longest_px), ".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 

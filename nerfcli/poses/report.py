@@ -158,10 +158,7 @@ def closing_notes(report: PosesReport) -> list[str]:
 
 
 def refusal(report: PosesReport, photos_dir: Path) -> UserError | None:
-    """Return the error for a refused result (exit code 4), or None if it is accepted.
-
-    It states the contradicting evidence, or the most frequent reason why photos are missing.
-    """
+    """Return the error (exit code 4) of a refused result, or None: the evidence, or why most photos are missing."""
     failures = report.verdict["failures"]
     enough = report.registered >= max(MIN_PHOTOS, report.settings.min_registered * report.total)
     if failures and (enough or "baseline" in failures[0]["kind"]):

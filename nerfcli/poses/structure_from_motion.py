@@ -59,11 +59,7 @@ def estimate_poses(
 
     Args:
         notify: receives messages for the user, one sentence at a time.
-        progress: receives (stage, done, total); the stages are "read", "extract", "enlarge" where photos have few
-            features, "faint" and "faint-enlarged" where these still have very few, "features" (per photo, of those
-            requested), "pair" where look-alikes are searched for, "match", "matches" (verified ones per photo), "map",
-            "merge" where the mapper leaves several models, "locate" where single photos are left, "check", "stabilise"
-            where the poses are accepted, "settle" where each photo gets a principal point of its own, in this order.
+        progress: receives (stage, done, total) of the stages of `input.plan.STAGES`, in their order.
         planned: receives the plan before the long work starts.
         given: known intrinsics, if any.
 
@@ -229,11 +225,7 @@ def _masks_of(report: PosesReport, scene_dir: Path) -> Path | None:
 
 
 def _split(report: PosesReport) -> dict[str, str | None]:
-    """Return which of the placed photos are for training and which for testing.
-
-    Raises:
-        UserError: all of them, or none, are held out.
-    """
+    """Return "train" or "test" for each of the placed photos; a UserError if all of them, or none, are held out."""
     placed = [image.name for image in report.images if image.registered]
     if report.strict is not None:
         test = frozenset(report.strict["placed"])

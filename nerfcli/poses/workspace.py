@@ -104,10 +104,7 @@ def check_destination(scene_dir: Path, photos_dir: Path, *, subfolders: bool) ->
 def is_same_scene(
     scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: Calibration | None = None
 ) -> bool:
-    """Return whether `scene_dir` was made from the current photos in `photos_dir` with these settings.
-
-    The settings threads and accept_refused are not compared.
-    """
+    """Return whether a scene was made from these photos with these settings, apart from threads and accept_refused."""
     try:
         report = read_json(scene_dir / "poses_report.json")
         made = scene_dir.resolve() / read_json(scene_dir / SCENE_FILE)["image_folder"]

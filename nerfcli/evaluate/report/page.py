@@ -59,12 +59,7 @@ def mark_of(runs: Sequence[Path]) -> page.Mark:
 
 
 def origin_of(runs: Sequence[RunFacts], hashes: Sequence[str], *, views: int, depth: DepthRequest) -> str:
-    """Return a digest of everything a page is made from: fields, metrics, logs, settings, and display options.
-
-    Args:
-        hashes: digests of their fields.
-        views, depth: number of held-out photos to show, and the depth that is shown.
-    """
+    """Return a digest of all that a page is made from: fields, by their `hashes`, metrics, logs, settings, options."""
     facts = [
         [run.label, run.config.to_json(), run.log, run.metrics and run.metrics.to_json(), run.poses] for run in runs
     ]

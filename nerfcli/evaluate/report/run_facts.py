@@ -18,15 +18,11 @@ POSES_REPORT = "poses_report.json"
 
 @dataclass(frozen=True)
 class RunFacts:
-    """Facts of one run.
+    """Facts of one run: its label on the page, configuration, log, training and held-out frames.
 
     Args:
-        label: its name on the page.
-        config: RUN/config.json.
-        log: RUN/log.jsonl.
         metrics: RUN/metrics.json; None if the run was not evaluated, or another checkpoint was.
         poses: the scene's poses_report.json; None if the poses came from elsewhere or the scene was moved.
-        frames: training and held-out frames.
         field_bytes: size of the checkpoint.
     """
 
@@ -41,11 +37,7 @@ class RunFacts:
 
 
 def read_facts(run: Run, label: str, *, checkpoint_sha256: str) -> RunFacts:
-    """Read all facts of a run.
-
-    Args:
-        label: its name on the page.
-        checkpoint_sha256: digest of its field; metrics of another checkpoint are left out.
+    """Read all facts of a run; metrics of another checkpoint than that with this digest are left out.
 
     Raises:
         UserError: it is not a run, or one of its files cannot be read.

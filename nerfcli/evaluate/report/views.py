@@ -70,12 +70,7 @@ def look_at(
     photo_depths: Sequence[DepthMap],
     on_progress: Callable[[float], None],
 ) -> list[HeldOutRenderings]:
-    """Render held-out photos of a run.
-
-    Args:
-        held_out: the photos; their masks must leave pixels to compare.
-        photo_depths: depths of all training photos.
-    """
+    """Render held-out photos, whose masks leave pixels to compare; `photo_depths` are those of all training photos."""
     views = []
     for photo in held_out:
         picture = render_picture(model, photo.frame, background=background_of(model, photo), depth=depth)
@@ -119,15 +114,7 @@ def depth_range(views: Sequence[HeldOutRenderings]) -> ColourRange:
 
 
 def error_map(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> np.ndarray:
-    """Colour the mean absolute difference of the channels, from 0 to `ERROR_RANGE`; grey where pixels are unused.
-
-    Args:
-        picture, photo: (H, W, 3) uint8.
-        used: (H, W) bool.
-
-    Returns:
-        (H, W, 3) uint8.
-    """
+    """Colour the mean absolute difference of pictures (H, W, 3) uint8, up to `ERROR_RANGE`; grey where not `used`."""
     difference = np.abs(picture.astype(np.float64) - photo).mean(-1) / 255.0
     colours = levels_of(ERROR_COLOURS)[to_8_bit(difference / ERROR_RANGE)]
     colours[~used] = 128
@@ -137,10 +124,7 @@ def error_map(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> np
 def spread_evenly(names: Sequence[str], count: int, *, quality: dict[str, float]) -> list[str]:
     """Choose up to `count` names, in their order: the worst, the best, and evenly between by rank of quality.
 
-    Args:
-        names: names of held-out photos.
-        count: >= 0.
-        quality: PSNR by name; if it is not known for all, the names are spread by their order.
+    `quality` is PSNR by name; if it is not known for all, the names are spread by their order.
     """
     if len(names) <= count:
         return list(names)

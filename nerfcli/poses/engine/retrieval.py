@@ -33,10 +33,7 @@ _VERSION = (
 
 
 def select_pairs(job: Job, report: Report) -> Job:
-    """Return the job with its final pairs: look-alikes of each photo added, pairs without common features removed.
-
-    A completed stage is not repeated.
-    """
+    """Return the job with its final pairs: look-alikes of each photo added, pairs without common features removed."""
     if job.neighbours == 0:
         return job
     path = job.stage_file("pairs")

@@ -86,10 +86,7 @@ def run_worker(
 
 
 def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> UserError:
-    """Return the error for a worker that ended with `returncode` during `stage`, with the last lines of its log.
-
-    If the disk that it wrote to is full, by its `free_bytes`, the log may be empty.
-    """
+    """Return the error for a worker that ended during `stage`, by its log, which may be empty if the disk is full."""
     # With less free space, SQLite and pycolmap cannot write the next part.
     if free_bytes < 2_000_000 or "disk is full" in log or os.strerror(ENOSPC) in log:
         return UserError(

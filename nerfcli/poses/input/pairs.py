@@ -1,7 +1,4 @@
-"""Choose which pairs of photos to match, or read them from a file.
-
-Matching all pairs is quadratic in the number of photos, and the longest step with a hundred of them.
-"""
+"""Choose which pairs of photos to match, since the time to match all is quadratic; or read them from a file."""
 
 import re
 from collections.abc import Container, Iterable, Iterator, Sequence
@@ -142,10 +139,7 @@ def order_of_capture(photos: Sequence[Photo]) -> list[int] | None:
 
 
 def capture_order(names: Sequence[str]) -> list[int] | None:
-    """Return the indices of the names sorted by number, if they differ only in one number; None otherwise.
-
-    Cameras and video tools write such names: IMG_0412.JPG, frame_9.png, frame_10.png.
-    """
+    """Return the indices of names such as frame_9.png, frame_10.png by number; None if anything else differs."""
     parts = [re.fullmatch(r"(.*?)(\d+)(\D*(?:\.[^.]*)?)", name) for name in names]  # .jp2 is no number
     matches = [match for match in parts if match]
     if len(matches) < len(names) or len({(match[1], match[3].lower()) for match in matches}) > 1:

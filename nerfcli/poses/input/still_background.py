@@ -45,11 +45,9 @@ _CLOSED_PX = 4
 class Background:
     """Static background, which may be larger than a photo.
 
-    Args:
-        colours: (h, w, 3) float32.
-        tolerance: (h, w) float32, of each pixel; beyond any difference where too few photos show it.
-        covered: (h, w) bool, where the object always covers it.
-        origin: its first pixel in the frame of reference, x and y.
+    colours: (h, w, 3) float32. tolerance: (h, w) float32, of each pixel; beyond any difference where too few photos
+    show it. covered: (h, w) bool, where the object always covers it. origin: x and y of its first pixel in the frame of
+    reference.
     """
 
     colours: np.ndarray

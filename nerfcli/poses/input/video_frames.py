@@ -158,15 +158,12 @@ def extract_frames(
 ) -> None:
     """Write the sharpest frames of a video to `folder`, or keep them if they are there already.
 
-    The video is divided into `count` stretches in which the camera moves equally far, not counting when it stands
-    still. The sharpest frame of each is written, unless it shows the same as the one before. The same video gives the
-    same frames.
+    Of frames that show the same, only one is written. The same video gives the same frames.
 
     Args:
         folder: gets frame_000123.jpg... and frames.json, all or nothing.
         count: how many; None for 120. A video with fewer frames gives all of them.
         overwrite: replace frames that were made from another video or with another count.
-        reporter: receives messages, and the fraction of the work that is done.
 
     Raises:
         UserError: the video cannot be read or is cut short, or shows fewer than four different pictures; or `folder`

@@ -80,12 +80,11 @@ def judge(
     determined: Collection[int] = (),
     checks: Checks | None = None,
 ) -> Verdict:
-    """Measure a model of a job's photos against the evidence and decide whether to accept it.
+    """Measure a converged model of a job's photos against the evidence and decide whether to accept it.
 
     A value that cannot be measured is None, and counts neither for nor against the model.
 
     Args:
-        model: a converged model.
         turn: how well rotations of the camera alone explain the matches.
         held: pairs that support photos located from points of the model, see `locate.shared_pairs`.
         determined: ids of cameras whose focal lengths are known to 1 %, see `lens_observability.focal_is_determined`.

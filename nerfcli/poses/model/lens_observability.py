@@ -57,12 +57,9 @@ _MODELS = {
 
 @dataclass(frozen=True)
 class DeterminedLens:
-    """Lens parameters that a capture determines.
+    """Lens parameters that a capture determines: a camera with the estimates of one step, where an adjustment starts.
 
-    Args:
-        camera: the camera with the parameters as estimated in one step, from which an adjustment starts.
-        principal_point: whether it is free.
-        held: whether the focal length stays as it is in `camera`, since the observations leave it open.
+    principal_point: whether it is free. held: whether the focal length stays, since the observations leave it open.
     """
 
     camera: pycolmap.Camera

@@ -66,9 +66,8 @@ def merge_models(
 
     Args:
         models: of the job's database, largest first; they are not changed.
-        seconds: time after which the remaining models are not merged.
+        seconds: time after which the remaining models are not merged; `tell` then receives how many are left.
         report: called with ("merge", models done, models in all).
-        tell: called with what was cut short, if anything was.
     """
     pairs = read_verified_pairs(job.database, min_matches=1)
     tracks = _matched_keypoints(job.database)
@@ -132,10 +131,7 @@ def common_points(
 
 
 def align(first: pycolmap.Reconstruction, common: CommonPoints, *, seed: int) -> pycolmap.Sim3d | None:
-    """Return the similarity first_from_second that moves most common points to where the first's photos see them.
-
-    Returns None if too few points agree.
-    """
+    """Return first_from_second, which moves most points to where the first's photos see them; None for too few."""
     count = len(common.first)
     if count < MIN_MATCHES:
         return None

@@ -21,11 +21,8 @@ def reason(
 ) -> str:
     """Return a phrase for the first condition that by itself explains why a photo was left out.
 
-    Args:
-        features: keypoints found in it.
-        best_matches: the most geometrically verified matches with any one photo; best_partner: that photo's name.
-        other_model_size: number of photos in another model with this photo, 0 without one.
-        size_px: width and height.
+    best_matches: the most verified ones with any one photo, best_partner. other_model_size: number of photos in another
+    model with this photo, 0 without one. size_px: width and height.
     """
     if other_model_size:
         return f"in another model of {other_model_size} photos"
