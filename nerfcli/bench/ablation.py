@@ -36,10 +36,8 @@ class Variant:
 class CaptureTraits:
     """Properties of a capture that components depend on.
 
-    Args:
-        has_alpha: whether its photos have alpha: then nothing is behind the object.
-        has_points: whether it states where structure-from-motion points were observed.
-        has_exif: whether EXIF states different exposures.
+    With alpha, nothing is behind the object. has_points: whether it states where structure-from-motion points were
+    observed. has_exif: whether EXIF states different exposures.
     """
 
     has_alpha: bool
@@ -50,9 +48,7 @@ class CaptureTraits:
 def variants(chosen: Components, capture: CaptureTraits, *, only: tuple[str, ...] = ()) -> list[Variant]:
     """Return models with one component removed from the chosen one, or added to it, in the order of `CHOICES`.
 
-    Args:
-        capture: decides which components can be tried.
-        only: names of components; all if empty.
+    The capture decides which can be tried; `only` these components, all if empty.
     """
     found = []
     for name in CHOICES:

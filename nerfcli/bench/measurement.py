@@ -45,12 +45,7 @@ SHORTEST_TRAINING_SECONDS = 8.0
 
 @dataclass(frozen=True)
 class RenderSetting:
-    """One way to render a trained field.
-
-    Args:
-        step: length of the steps along rays, relative to those of the training.
-        tolerance: see `render.pictures.render_picture`.
-    """
+    """One way to render a trained field: steps along rays, relative to those of the training, and a tolerance."""
 
     threads: int
     step: float = 1.0
@@ -70,12 +65,7 @@ class RenderSetting:
 
 @dataclass(frozen=True)
 class TrainSetting:
-    """One training.
-
-    Args:
-        fraction: training time relative to the planned time of one training.
-        changed: values that differ from the defaults of `TrainSettings`, by name.
-    """
+    """One training: its time relative to the planned one, and what differs from the defaults of `TrainSettings`."""
 
     name: str
     fraction: float = 1.0
@@ -267,8 +257,7 @@ def measure_trainings(
 ) -> None:
     """Train a scene with as many settings as time allows, each for the same time unless it is the time that varies.
 
-    Args:
-        work: folder for the runs; they are deleted again.
+    The runs are in the folder `work` and are deleted again.
 
     Raises:
         UserError: see `nerfcli.training.loop.train`; or nothing was held out.

@@ -19,17 +19,15 @@ BEST = "yes"
 
 @dataclass(frozen=True)
 class Point:
-    """One setting with its time and its error.
+    """One setting, by what differs from the default, with its time and its error.
 
     Args:
-        name: what differs from the default.
         seconds: median time of one picture, or of the training.
         low, high: quartiles of the repeats.
         peak_memory_bytes: None if the system does not report it.
         psnr: on held-out photos, dB.
         levels_off: root mean square difference from a converged rendering of the same field, in levels of 255; None for
             trainings, whose error is their PSNR.
-        steps: of a training.
     """
 
     name: str

@@ -56,12 +56,9 @@ _EXPLAINED = 0.8
 
 @dataclass(frozen=True)
 class TwoViews:
-    """Camera motion between two photos: rotation only, in front of a plane, or with parallax at all depths.
+    """Camera motion between two photos, and the distance between the cameras relative to that of the scene.
 
-    Args:
-        flat: True if a homography explains the pair, so that it shows no depth: the camera only turned, or everything
-            it saw is flat.
-        baseline_over_depth: distance between the camera positions, relative to the distance of the scene.
+    flat: whether a homography explains the pair, so that it shows no depth: the camera only turned, or all is flat.
     """
 
     flat: bool
@@ -70,13 +67,10 @@ class TwoViews:
 
 @dataclass(frozen=True)
 class Patch:
-    """A part of the first photo that moved independently.
+    """A part of the first photo that moved independently, with a number of matches.
 
-    Args:
-        box: left, top, right, bottom in the first photo, pixels at `photo_facts.LONGER_SIDE_PX`.
-        other_box: the same in the second photo.
-        matches: number of matches in the patch.
-        still: True if it is fixed in the image, like a watermark or the background of a turntable.
+    Boxes are left, top, right, bottom in the first and in the second photo, pixels at `photo_facts.LONGER_SIDE_PX`.
+    still: whether it is fixed in the image, like a watermark or the background of a turntable.
     """
 
     box: tuple[float, float, float, float]

@@ -45,11 +45,9 @@ class ExaminedCapture:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Result of an examination.
+    """Result of an examination: the findings, in order, and (name, reason) of the checks that were not made.
 
     Args:
-        findings: results of the checks that were made, in order.
-        not_checked: (name, reason) of the checks that were not made.
         missing_detail: (photos,) log2 of the detail that each photo lacks relative to the others; NaN without texture.
         exposure_stops: (photos,) stops by which each shows the same points brighter than the median photo; NaN where
             unknown.

@@ -99,7 +99,6 @@ class PhotoFacts:
     """Measurements of one photo.
 
     Args:
-        name: its name in the capture.
         exif: with the upright size.
         digest: SHA-256 of the file.
         thumbnail: a small JPEG.

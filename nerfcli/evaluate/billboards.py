@@ -46,8 +46,7 @@ class GeometryEvidence:
 
     Args:
         psnr: PSNR of the billboards, mean over the photos, dB.
-        field_psnr: PSNR of the field on the same pixels.
-        gain_db: field_psnr minus psnr.
+        field_psnr: PSNR of the field on the same pixels; gain_db is the difference.
         error_db: its standard error, see `gain_error_db`; None if no photo has two parts.
         shown: whether the gain is significant.
         seconds: the time that fitting and comparing took.
@@ -198,13 +197,7 @@ class GeometryComparison:
         self.failure: str | None = None
 
     def add(self, frame: Frame, rendered: np.ndarray, photo: np.ndarray, used: np.ndarray) -> None:
-        """Compare random pixels of one held-out photo, reduced to the size of the billboards.
-
-        Args:
-            rendered: (H, W, 3) sRGB of the field.
-            photo: (H, W, 3) uint8.
-            used: (H, W) bool, the pixels that count; at least one.
-        """
+        """Compare random pixels of a photo (H, W, 3) uint8 with the field's sRGB, reduced as the billboards are."""
         if self.failure is None:
             try:
                 self._compare(frame, rendered, photo, used)

@@ -30,12 +30,9 @@ def measure_depth_errors(
     threads: int,
     on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> DepthErrors:
-    """Compare the median depth of held-out photos with stereo matching.
+    """Compare the median depth of the held-out photos of a run with stereo matching.
 
-    Args:
-        run: a run whose held-out photos are on disk.
-        photo_depths: depth maps of its training photos, in their order.
-        threads: number of photos in progress.
+    `photo_depths` are depth maps of its training photos, in their order.
 
     Raises:
         UserError: there are no held-out photos, or a photo cannot be read.

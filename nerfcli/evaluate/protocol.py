@@ -110,13 +110,9 @@ PROTOCOL = "nerfcli-2"
 
 @dataclass(frozen=True)
 class Extras:
-    """Optional measurements.
+    """Optional measurements: the novelty of held-out views among the training views, LPIPS, a model without geometry.
 
-    Args:
-        training: the training views, to measure the novelty of the held-out ones.
-        perceptual: LPIPS, if available.
-        billboards: a model without geometry to compare the field with.
-        keep: called with each compared pair.
+    `keep` is called with each compared pair.
     """
 
     training: Sequence[Frame] = ()
@@ -134,7 +130,6 @@ class PhotoMetrics:
         masked_pixels, pixels_without_ray: numbers of those that do not.
         whole_windows: number of windows that SSIM is a mean of.
         exposure: the gains that were applied to the picture, and their source.
-        seconds: time of rendering it.
         view: its distance from the training views; None if these are not known.
     """
 
@@ -168,10 +163,7 @@ class RunMetrics:
     """All metrics of a run, or of splats, as in metrics.json.
 
     Args:
-        protocol: what was measured and how.
-        mean: over the held-out photos.
         shape: comparison with a model without geometry; None if it was not made.
-        training: summary of the training.
         ledger: which stages used the held-out photos.
         splats: file, count and degree, of splats.
     """

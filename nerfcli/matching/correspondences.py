@@ -21,11 +21,7 @@ LONGER_SIDE_PX = 600
 
 
 class SharedFeatures:
-    """Features and 3D points shared by training photos.
-
-    Args:
-        model_tracks: reads the tracks of structure from motion, on first use; without any, features are matched.
-    """
+    """Features and points that training photos share; `model_tracks` reads those of structure from motion, if any."""
 
     def __init__(self, photos: Sequence[LoadedPhoto], model_tracks: Callable[[], Tracks], *, threads: int):
         self._photos, self._model_tracks, self._threads = photos, model_tracks, threads

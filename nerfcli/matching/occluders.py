@@ -107,10 +107,8 @@ class _Small:
 class _Expected:
     """The nearest surface on which other photos agree, for each pixel of a small photo; NaN where there is none.
 
-    Args:
-        distances: (h, w).
-        levels: (h, w, 3) at the exposure of the small photo.
-        spreads: (h, w) standard deviations of the levels; the largest of the channels.
+    distances: (h, w). levels: (h, w, 3) at the exposure of the small photo. spreads: (h, w), the largest standard
+    deviation of the channels of the levels.
     """
 
     distances: np.ndarray

@@ -63,11 +63,9 @@ def sky_masks(photos: Sequence[LoadedPhoto], *, threads: int) -> list[np.ndarray
 
 @dataclass(frozen=True)
 class PointsBefore:
-    """Points of surfaces in front of the pixels of sky masks.
+    """Points in front of the pixels of sky masks: how many were found in all photos, and how many are expected.
 
-    Args:
-        found: their number, over all photos.
-        expected: the number that these pixels would have if they were as rich in points as the others.
+    These pixels are expected to be as rich in points as the others.
     """
 
     found: int
@@ -102,14 +100,10 @@ def points_of_depths(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth])
 
 
 def points_before(masks: Sequence[np.ndarray], photos: Sequence[LoadedPhoto], points: np.ndarray) -> PointsBefore:
-    """Count the points that are in the sky of a photo.
+    """Count the points (N, 3) of surfaces that are in the sky of a photo, by the masks (H, W) of `sky_masks`.
 
     A point hides the sky behind it. So a point that some photos see is outside the sky of all others, at any distance.
     A photo of a plain wall, however, has points of its neighbours behind the wall, and a few on it.
-
-    Args:
-        masks: (H, W) for each photo, see `sky_masks`.
-        points: (N, 3) of surfaces, see `points_of_tracks` and `points_of_depths`.
     """
     points = points[:: math.ceil(len(points) / MOST_POINTS) or 1]
     found, expected = 0, 0.0

@@ -77,9 +77,7 @@ def titled(text: str) -> str:
 def curves(drawn: Sequence[Curve], *, y_title: str, logarithmic: bool = False) -> "Figure | None":
     """Draw curves over seconds; return None if there is nothing to draw.
 
-    Args:
-        drawn: curves; values that are not finite, or not positive on a logarithmic axis, are left out.
-        y_title: title of the y axis, with the unit.
+    Values that are not finite, or not positive on a logarithmic axis, are left out. `y_title` has the unit.
     """
     kept = []
     for curve in drawn:

@@ -10,12 +10,10 @@ VERDICTS = (GOOD, LOOK, BAD)
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one check.
+    """The result of a check, in one line.
 
     Args:
-        check: its name.
         verdict: good; look: usable, but expect lower quality; bad: fix it before any long computation.
-        summary: one line that describes the result.
         number: the measured value; None if it is not a number.
         threshold: description of the limits on the number.
         advice: what to do; empty if there is nothing to do.

@@ -56,7 +56,6 @@ def page_html(
     """Return a complete page that loads nothing from elsewhere, enforced by a content security policy.
 
     Args:
-        title: plain text.
         style: CSS that follows `page.css`.
         body: HTML, in which all outside text is escaped.
         script: JavaScript that runs once the body exists; for its data see `data_element`.
@@ -184,9 +183,7 @@ def claim_page(output: Output, path: Path, mark: Mark, *, about: str) -> None:
 class Table:
     """A table of plain text, for the macro of `parts.html`; it scrolls sideways where the window is too narrow.
 
-    Args:
-        rows: each with as many cells as there are columns.
-        numbers: indices of the columns that are aligned to the right.
+    numbers: indices of the columns that are aligned to the right.
     """
 
     columns: Sequence[str]

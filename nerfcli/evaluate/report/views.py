@@ -27,14 +27,12 @@ _COVERAGE = DepthRequest("median", "ray")
 
 @dataclass(frozen=True)
 class HeldOutRenderings:
-    """Renderings of a held-out photo by a run.
+    """Renderings of a held-out photo by a run, and their PSNR and SSIM, as in `evaluate`.
 
     Args:
-        name: name of the photo.
         photo, picture, error: (H, W, 3) uint8 sRGB; RGBA photos on white.
         depth: (H, W) in the unit of the scene, NaN where there is none.
         coverage: (h, w) number of training photos that see the surface, in a smaller picture; NaN where there is none.
-        metrics: PSNR and SSIM, as in `evaluate`.
     """
 
     name: str

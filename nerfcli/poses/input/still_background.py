@@ -76,10 +76,9 @@ def small(picture: np.ndarray) -> np.ndarray:
 
 
 def background(pictures: Sequence[np.ndarray], placed: Sequence[np.ndarray], places: np.ndarray) -> Background:
-    """Estimate the static background of pictures (h, w, 3) from one camera position, `LEAST_PHOTOS` or more.
+    """Estimate the static background of `LEAST_PHOTOS` or more equally large pictures (h, w, 3), see `small`.
 
     Args:
-        pictures: of equal size, see `small`.
         placed: the similarity (2, 3) of each, from pixels of the frame of reference to its own.
         places: (N, 2) positions of static features in the frame of reference, as fractions of width and height, 0...1.
     """
