@@ -6,6 +6,7 @@ Notation: a camera has centre c and unit viewing direction d.
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from nerfcli.cameras.frame import Frame
 
@@ -28,6 +29,11 @@ def centres_of(frames: Sequence[Frame]) -> np.ndarray:
 def views_of(frames: Sequence[Frame]) -> np.ndarray:
     """Return the unit viewing directions (optical axes), (frames, 3)."""
     return np.stack([frame.world_from_cam[:3, 2] for frame in frames])
+
+
+def gaps_between(centres: np.ndarray) -> np.ndarray:
+    """Return the distances of two or more centres (N, 3) to the nearest other one, (N,)."""
+    return KDTree(centres).query(centres, k=2)[0][:, 1]
 
 
 def focus_point(frames: Sequence[Frame], *, depth_hint: float | None = None) -> np.ndarray:

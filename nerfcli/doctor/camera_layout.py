@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerfcli.cameras import rigid
-from nerfcli.cameras.layout import centres_of, focus_point, horizontal_axes, up_direction, views_of
+from nerfcli.cameras.layout import centres_of, focus_point, gaps_between, horizontal_axes, up_direction, views_of
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import find_model, read_model
 from nerfcli.doctor.geometry import BASELINE_BAD, BASELINE_LOOK
@@ -39,9 +39,7 @@ def spread(scene: Capture) -> Finding:
     ratio = float(np.sqrt(np.mean(distances**2)) / np.median(depths))
     typical = float(np.median(distances))
     far = [i for i in np.argsort(-distances) if distances[i] > FARTHEST * typical and typical > 0]
-    nearest = np.linalg.norm(centres[:, None] - centres, axis=2)
-    np.fill_diagonal(nearest, np.inf)
-    step = float(np.median(nearest.min(axis=1) / depths)) if len(centres) > 1 else 0.0
+    step = float(np.median(gaps_between(centres) / depths)) if len(centres) > 1 else 0.0
     verdict = worst([verdict_below(ratio, look=BASELINE_LOOK, bad=BASELINE_BAD), LOOK if far else GOOD])
     summary = f"camera spread / depth {ratio:.2f}, distance to the nearest camera / depth {step:.3f}"
     advice = "step sideways between photos: depth is visible only if the camera moves"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.layout import focus_point
+from nerfcli.cameras.layout import centres_of, focus_point, gaps_between
 from nerfcli.errors import UserError, listed
 from nerfcli.evaluate.billboards import Billboards, GeometryComparison, GeometryEvidence
 from nerfcli.evaluate.ledger import Entry
@@ -61,9 +61,9 @@ class Novelty:
 
 def novelty(held_out: Sequence[Frame], training: Sequence[Frame]) -> list[Novelty]:
     """Compute the novelty of each held-out view; `training` has at least one view."""
-    centres = np.array([frame.centre for frame in training])
+    centres = centres_of(training)
     radius = float(np.median(np.linalg.norm(centres - focus_point(training), axis=1)))
-    spacing = _spacing(centres)
+    spacing = float(np.median(gaps_between(centres))) if len(training) > 1 else None
     found = []
     for frame in held_out:
         distances = np.linalg.norm(centres - frame.centre, axis=1)
@@ -86,18 +86,6 @@ def novelty(held_out: Sequence[Frame], training: Sequence[Frame]) -> list[Novelt
             )
         )
     return found
-
-
-def _spacing(centres: np.ndarray) -> float | None:
-    """Return the median distance from a centre to the nearest other one; None for fewer than two."""
-    if len(centres) < 2:
-        return None
-    nearest = []
-    for index, centre in enumerate(centres):
-        distances = np.linalg.norm(centres - centre, axis=1)
-        distances[index] = np.inf
-        nearest.append(float(distances.min()))
-    return float(np.median(nearest))
 
 
 def _angle_deg(one: Frame, other: Frame) -> float:

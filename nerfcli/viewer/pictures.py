@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame, chosen_evenly
-from nerfcli.cameras.layout import centres_of
+from nerfcli.cameras.layout import centres_of, gaps_between
 from nerfcli.pages.page import data_uri, jpeg_bytes
 from nerfcli.photos.colours import over_white
 from nerfcli.photos.held_out_exposure import PhotoExposures, log_gains_of
@@ -91,7 +90,7 @@ def photo_jpeg(train: Sequence[Frame], test: Sequence[Frame], index: int, *, lon
 def frustum_depth(frames: Sequence[Frame], size: float) -> float:
     """Return the drawn depth of frusta: half the median distance between neighbours, at most a tenth of the scene."""
     centres = centres_of(frames)
-    gap = float(np.median(KDTree(centres).query(centres, k=2)[0][:, 1])) if len(frames) > 1 else size
+    gap = float(np.median(gaps_between(centres))) if len(frames) > 1 else size
     return min(0.5 * gap, 0.1 * size) or 0.1 * size
 
 
