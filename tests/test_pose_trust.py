@@ -818,7 +818,7 @@ def test_a_model_that_the_matches_contradict_is_left_out_when_several_are_joined
     )
     radius = np.linalg.norm(base.image(1).projection_center())
     shift = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array([0.0, 0.0, radius]))
-    given = [merging._Aligned(wrong, shift), merging._Aligned(right, pycolmap.Sim3d())]
+    given = [(wrong, shift), (right, pycolmap.Sim3d())]
     with pycolmap.Database.open(solved.job.database) as database:
         cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions(min_num_matches=15))
     pairs = read_verified_pairs(solved.job.database, min_matches=1)

@@ -34,12 +34,8 @@ from nerfcli.poses.model.two_views import VerifiedPair, agreements, count_matche
 _TOLERANCE, _REFINEMENTS = 1e-4, 2
 
 
-@dataclass(frozen=True)
-class _Aligned:
-    """A model, and the similarity that moves it into the frame of another."""
-
-    model: pycolmap.Reconstruction
-    base_from_model: pycolmap.Sim3d
+# A model, and the similarity that moves it into the frame of another.
+_Aligned = tuple[pycolmap.Reconstruction, pycolmap.Sim3d]
 
 
 @dataclass(frozen=True)
@@ -88,9 +84,9 @@ def merge_models(
                 tell(f"merging: {len(left)} of {len(models)} sub-models are left after {duration(seconds)}")
                 return _largest_first([*merged, base, *left])
             similarities = [align(base, common_points(base, model, tracks), seed=job.seed) for model in left]
-            aligned = [_Aligned(model, s) for model, s in zip(left, similarities, strict=True) if s is not None]
+            aligned = [(model, s) for model, s in zip(left, similarities, strict=True) if s is not None]
             base, taken = join(base, aligned)
-            left = [model for model in left if not any(model is one.model for one in taken)]
+            left = [model for model in left if not any(model is one for one, _ in taken)]
             grows = bool(taken)
         if not any(base is model for model in models):
             base = _triangulated_again(base, job)
@@ -184,9 +180,9 @@ def _join(
     while aligned:
         joined = pycolmap.Reconstruction(base)
         owners = dict.fromkeys(base.reg_image_ids(), -1)
-        for number, one in enumerate(aligned):
-            moved = pycolmap.Reconstruction(one.model)
-            moved.transform(one.base_from_model)
+        for number, (model, base_from_model) in enumerate(aligned):
+            moved = pycolmap.Reconstruction(model)
+            moved.transform(base_from_model)
             owners = dict.fromkeys(moved.reg_image_ids(), number) | owners
             _add(joined, moved, {photo for photo, owner in owners.items() if owner == number})
         _merge_tracks(joined, cache, seed=job.seed)
