@@ -24,7 +24,7 @@ from nerfcli.poses.judge.contradictions import leave_out_contradicting, without_
 from nerfcli.poses.judge.parallax import RotationFit, best_rotation_fit, panorama_rotation_fit
 from nerfcli.poses.model import held_out
 from nerfcli.poses.model.intrinsics import ModelLenses, choose_lenses
-from nerfcli.poses.model.lens_evidence import projection_jacobians
+from nerfcli.poses.model.lens_evidence import pose_jacobians, projection_jacobians
 from nerfcli.poses.model.lens_observability import focal_is_determined
 from nerfcli.poses.model.locate import shared_pairs
 from nerfcli.poses.model.projection import Array
@@ -179,16 +179,12 @@ def _pixel_metric(model: pycolmap.Reconstruction, photo: int) -> Array:
     points = np.array([model.point3D(point.point3D_id).xyz for point in chosen]).reshape(-1, 3)
     rotated = points @ pose.rotation.matrix().T
     local = rotated + pose.translation
-    metric, counted = np.zeros((6, 6)), 0
-    for turned, point, jacobian in zip(rotated, local, projection_jacobians(camera, local), strict=True):
-        if not np.isfinite(jacobian).all() or point[2] <= 0:
-            continue
-        x, y, z = turned
-        by_rotation = jacobian @ np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])  # d(w x RX) / dw = -[RX]x
-        both = np.hstack([by_rotation, jacobian])
-        metric += both.T @ both
-        counted += 1
-    return metric / max(counted, 1)
+    jacobians = projection_jacobians(camera, local)
+    usable = np.isfinite(jacobians).all(axis=(1, 2)) & (local[:, 2] > 0)
+    metric = np.zeros((6, 6))
+    for of_pose in pose_jacobians(jacobians[usable], rotated[usable]):
+        metric += of_pose.T @ of_pose
+    return metric / max(int(usable.sum()), 1)
 
 
 def _gauge_directions(image: pycolmap.Image) -> Array:

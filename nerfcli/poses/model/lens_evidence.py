@@ -259,12 +259,7 @@ def _jacobians(
         local = rotated + pose.translation
         local[local[:, 2] <= 1e-6 * np.abs(local).max(axis=1, initial=1e-300)] = np.nan
         jacobian = projection_jacobians(camera, local)
-        x, y, z = rotated.T
-        turned = np.zeros((len(rows), 3, 3))  # -[RX]x
-        turned[:, 0, 1], turned[:, 0, 2], turned[:, 1, 2] = z, -y, x
-        turned -= turned.transpose(0, 2, 1)
-        poses[rows] = np.concatenate([jacobian @ turned, jacobian], axis=2)
-        points[rows] = jacobian @ rotation
+        poses[rows], points[rows] = pose_jacobians(jacobian, rotated), jacobian @ rotation
         residuals[rows] = seen.pixels[rows] - projected(camera, local)
         terms, of = _lens_terms(camera, local), seen.lenses[position]
         if of == camera_id:
@@ -290,6 +285,15 @@ def projection_jacobians(camera: pycolmap.Camera, local: Array) -> Array:
             (projected(camera, local + step * offset) - projected(camera, local - step * offset)) / (2 * step)
         )
     return np.stack(columns, axis=-1)
+
+
+def pose_jacobians(jacobians: Array, rotated: Array) -> Array:
+    """Return pixels per unit of a rotation w after R and of t (n, 2, 6), at points RX (n, 3): d(w x RX)/dw = -[RX]x."""
+    x, y, z = rotated.T
+    turned = np.zeros((len(rotated), 3, 3))
+    turned[:, 0, 1], turned[:, 0, 2], turned[:, 1, 2] = z, -y, x
+    turned -= turned.transpose(0, 2, 1)
+    return np.concatenate([jacobians @ turned, jacobians], axis=2)
 
 
 def _lens_terms(camera: pycolmap.Camera, local: Array) -> Array:
