@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_photos import NO_EXIF
 from walks import FOCAL_PX, HEIGHT, WIDTH, walk, write
 
 from nerfcli.cameras import rigid
@@ -31,12 +32,11 @@ from nerfcli.doctor.pose_agreement import (
     poses_by_matches,
 )
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding
-from nerfcli.photos.exif import Exif
 
 CAMERA = Camera.pinhole(1600, 1200, 1400.0)
 SIZE = (800, 600)  # features are at half the size of the photos
 UP = np.array([0.0, 0.0, 1.0])
-EXIF = Exif(None, None, None, None, None, 1, 1600, 1200, None, None, None)
+EXIF = replace(NO_EXIF, width=1600, height=1200)
 
 
 def ring(count: int = 24, *, camera: Camera = CAMERA) -> list[Frame]:

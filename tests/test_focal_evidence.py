@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 from PIL import ExifTags, Image
-from test_photos import NO_EXIF, photo
+from test_photos import NO_EXIF, taken
 
 from nerfcli.photos.exif import Exif, read_exif
 from nerfcli.photos.focal_evidence import focal_evidence, with_digital_zoom
 from nerfcli.poses.engine.database import camera_of_group
 from nerfcli.poses.input.photos import Photos, camera_groups, find_photos
-from nerfcli.poses.model.cameras import group_photos
+from nerfcli.poses.model.cameras import PhotoGroups, group_photos
 
 # A full-frame camera with a lens of 50 mm, by its own numbers: 50 / 36 * 5472 = 7600 pixels.
 CAMERA = replace(
@@ -22,6 +22,11 @@ PHONE = replace(NO_EXIF, make="A", model="P", focal_mm=4.0, focal_35mm=28.0, wid
 
 def sized(exif: Exif, width: int, height: int) -> Exif:
     return replace(exif, width=width, height=height)
+
+
+def grouped(*exifs: Exif) -> PhotoGroups:
+    """Return the cameras of photos with these EXIF data."""
+    return group_photos(Photos(Path(), tuple(taken(*exifs)), {}), model="auto")
 
 
 @pytest.mark.parametrize(
@@ -138,58 +143,45 @@ def test_photos_with_other_digital_zooms_have_other_cameras(ratio, zoom, tmp_pat
 
 
 def test_cameras_start_from_exif_only_where_it_holds():
-    whole, cropped, nothing = CAMERA, sized(CAMERA, 640, 640), sized(NO_EXIF, 640, 480)
-    photos = [
-        photo(f"{n}.jpg", exif, size=(exif.width, exif.height)) for n, exif in enumerate((whole, cropped, nothing))
-    ]
-    grouped = group_photos(Photos(Path(), tuple(photos), {}), model="auto")
-    cameras = [camera_of_group(group) for group in grouped.groups]
+    found = grouped(CAMERA, sized(CAMERA, 640, 640), sized(NO_EXIF, 640, 480))
+    cameras = [camera_of_group(group) for group in found.groups]
     assert [camera.has_prior_focal_length for camera in cameras] == [True, False, False]
     assert [camera.mean_focal_length() for camera in cameras] == pytest.approx([7600, 7600 * 640 / 3648, 768])
-    assert grouped.notes[1:] == (
+    assert found.notes[1:] == (
         "EXIF's focal length is only a starting value for 1.jpg: EXIF is for 5472x3648 pixels, but the file has "
         "640x640: cropped after the shot",
     )
-    bare = [camera_of_group(replace(group, focal_px=None, focal_is_prior=False)) for group in grouped.groups]
+    bare = [camera_of_group(replace(group, focal_px=None, focal_is_prior=False)) for group in found.groups]
     assert [camera.mean_focal_length() for camera in bare] == pytest.approx([1.2 * 5472, 768, 768])
     assert not any(camera.has_prior_focal_length for camera in bare)
 
 
 def test_cameras_are_listed():
-    def notes(exifs: list[Exif]) -> tuple[str, ...]:
-        photos = [photo(f"{n}.jpg", exif, size=(exif.width, exif.height)) for n, exif in enumerate(exifs)]
-        return group_photos(Photos(Path(), tuple(photos), {}), model="auto").notes
-
     big, small = sized(NO_EXIF, 4000, 3000), sized(NO_EXIF, 640, 480)
-    assert notes([big, big]) == ()
-    assert notes([big, big, small]) == (
+    assert grouped(big, big).notes == ()
+    assert grouped(big, big, small).notes == (
         "2 cameras, by EXIF and size: 2 photos of 4000x3000 (SIMPLE_RADIAL), 1 photo of 640x480 (SIMPLE_RADIAL)",
     )
     zooms = [replace(CAMERA, focal_mm=float(20 * n)) for n in range(1, 8)]
-    (note,) = notes([*zooms, replace(zooms[0], lens="8mm Fisheye")])
+    (note,) = grouped(*zooms, replace(zooms[0], lens="8mm Fisheye")).notes
     assert note == (
         "8 cameras, by EXIF and size: 1 photo of 5472x3648 (OPENCV_FISHEYE), 7 photos of 5472x3648 (SIMPLE_RADIAL)"
     )
-    (note,) = notes([replace(CAMERA, lens="8mm Fisheye"), *(sized(NO_EXIF, 600 + n, 480) for n in range(22))])
+    (note,) = grouped(replace(CAMERA, lens="8mm Fisheye"), *(sized(NO_EXIF, 600 + n, 480) for n in range(22))).notes
     assert note.startswith("23 cameras, by EXIF and size: 1 photo of 5472x3648 (OPENCV_FISHEYE), 1 photo of 600x480 (")
     assert note.endswith("1 photo of 604x480 (SIMPLE_RADIAL) and 17 more")
 
 
 def test_doubts_about_exif_are_one_note_for_a_reason_and_few_in_all():
-    crops = [sized(CAMERA, 640 + 8 * (n // 2), 640) for n in range(14)]
-    photos = [photo(f"{n:02}.jpg", exif, size=(exif.width, exif.height)) for n, exif in enumerate(crops)]
-    _, *doubts = group_photos(Photos(Path(), tuple(photos), {}), model="auto").notes
+    _, *doubts = grouped(*(sized(CAMERA, 640 + 8 * (n // 2), 640) for n in range(14))).notes
     assert len(doubts) == 5
     assert doubts[0].startswith(
-        "EXIF's focal length is only a starting value for 00.jpg and 1 more photo: EXIF is for 5472x3648"
+        "EXIF's focal length is only a starting value for 0.jpg and 1 more photo: EXIF is for 5472x3648"
     )
     assert doubts[-1] == "and for 6 more photos, for reasons like these"
 
 
 def test_crops_of_other_pictures_are_other_cameras_and_autofocus_is_not():
     a, b = sized(CAMERA, 640, 640), replace(sized(CAMERA, 640, 640), taken_px=(4000, 3000))
-    photos = [
-        photo(str(n), exif, size=(640, 640))
-        for n, exif in enumerate((a, b, replace(a, focal_mm=50.6), replace(a, focal_mm=52.0)))
-    ]
+    photos = taken(a, b, replace(a, focal_mm=50.6), replace(a, focal_mm=52.0))
     assert camera_groups(photos) == ((0, 2), (1,), (3,))

@@ -149,22 +149,20 @@ def test_a_folder_without_masks_is_reported_before_the_work(photos, masks):
     """In a dry run, too."""
 
     def plan(folder: Path) -> None:
-        plan_poses(photos.folder, settings=PoseSettings(masks=str(folder)))
+        settings = PoseSettings(masks=str(folder))
+        plan_poses(photos.folder, settings=settings, progress=lambda stage, *done: stages.append(stage))
+
+    stages: list[str] = []
 
     with pytest.raises(UserError, match="contains no mask for any photo") as error:
         plan(masks)
     assert "p 0.png.png or p 0.png" in error.value.hint
     with pytest.raises(UserError, match="contains photos, such as"):
         plan(photos.folder)
-
-
-def test_a_folder_that_does_not_exist_is_refused_before_photos_are_read(photos, tmp_path):
-    """In a dry run, too."""
-    stages: list[str] = []
-    settings = PoseSettings(masks=str(tmp_path / "absent"))
+    stages.clear()
     with pytest.raises(UserError, match=r"the mask folder .*absent does not exist"):
-        plan_poses(photos.folder, settings=settings, progress=lambda stage, *done: stages.append(stage))
-    assert stages == []
+        plan(masks / "absent")
+    assert stages == []  # before photos are read
 
 
 def test_masks_may_be_in_the_folder_above_the_photos(photos, masks, tmp_path):

@@ -111,10 +111,7 @@ def test_photos_that_gps_separates_are_compared_with_the_nearest():
     around = (44 - 10, 44 + 10, 44 - 1, 44 + 1, 44 - 11, 44 - 9, 44 + 9, 44 + 11)
     assert all((min(44, j), max(44, j)) in pairs for j in around)
     assert all(abs(i // 10 - j // 10) <= 5 and abs(i % 10 - j % 10) <= 5 for i, j in pairs)
-
-
-def test_photos_closer_than_the_error_of_gps_are_not_compared_by_it():
-    assert choose_pairs(grid(spacing_deg=0.00001)).rule == "retrieval"
+    assert choose_pairs(grid(spacing_deg=0.00001)).rule == "retrieval"  # closer than the error of GPS
 
 
 @pytest.mark.parametrize("rule", ["auto", "spatial"])

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,19 +17,9 @@ from nerfcli.photos.exif import Exif
 from nerfcli.poses.input.photos import Photo, camera_groups, find_photos
 from nerfcli.poses.model.reasons import NO_TRAINING_PHOTO, dominant, reason
 
-NO_EXIF = Exif(
-    make=None,
-    model=None,
-    lens=None,
-    focal_mm=None,
-    focal_35mm=None,
-    orientation=1,
-    width=64,
-    height=48,
-    exposure_seconds=None,
-    iso=None,
-    gps=None,
-)
+_ABSENT = ("make", "model", "lens", "focal_mm", "focal_35mm", "exposure_seconds", "iso", "gps")
+_UNKNOWN: dict[str, Any] = dict.fromkeys(_ABSENT)
+NO_EXIF = Exif(orientation=1, width=64, height=48, **_UNKNOWN)
 
 
 def save_photo(path: Path, *, seed: int = 0, size: tuple[int, int] = (64, 48), orientation: int = 1) -> None:
@@ -117,23 +108,17 @@ def test_photos_one_level_down_are_pointed_at(folder: Path):
     assert str(folder) in caught.value.hint
 
 
-def photo(name: str, exif: Exif, *, size: tuple[int, int] = (64, 48)) -> Photo:
-    return Photo(name=name, width=size[0], height=size[1], exif=exif)
+def taken(*exifs: Exif) -> list[Photo]:
+    """Return photos with these EXIF data, named by their number."""
+    return [Photo(f"{number}.jpg", exif.width, exif.height, exif) for number, exif in enumerate(exifs)]
 
 
 def test_photos_share_a_camera_when_all_optics_and_the_size_agree():
     phone = replace(NO_EXIF, make="A", model="B", lens="wide", focal_mm=4.0, focal_35mm=28.0)
-    photos = [
-        photo("1", phone),
-        photo("2", NO_EXIF),
-        photo("3", replace(phone, exposure_seconds=0.5, orientation=6)),
-        photo("4", replace(phone, lens="tele")),
-        photo("5", replace(phone, focal_35mm=56.0)),
-        photo("6", phone, size=(48, 64)),
-        photo("7", NO_EXIF),
-        photo("8", NO_EXIF, size=(128, 96)),
-    ]
-    assert camera_groups(photos) == ((0, 2), (1, 6), (3,), (4,), (5,), (7,))
+    later, large = replace(phone, exposure_seconds=0.5, orientation=6), replace(NO_EXIF, width=128, height=96)
+    others = replace(phone, lens="tele"), replace(phone, focal_35mm=56.0), replace(phone, width=48, height=64)
+    groups = camera_groups(taken(phone, NO_EXIF, later, *others, NO_EXIF, large))
+    assert groups == ((0, 2), (1, 6), (3,), (4,), (5,), (7,))
 
 
 @pytest.mark.parametrize(
@@ -153,8 +138,7 @@ def test_the_dominant_reason_brings_its_advice():
     few = reason(10, 0, None, other_model_size=0, size_px=(40, 30))
     alone = reason(4000, 3, "a", other_model_size=0, size_px=(40, 30))
     kind, advice = dominant([few, alone, alone, "unreadable: damaged"])
-    assert kind == "matches no other photo well"
-    assert "overlap" in advice
+    assert (kind, "overlap" in advice) == ("matches no other photo well", True)
     assert "--holdout" in dominant([NO_TRAINING_PHOTO])[1]
     assert "overlap" in dominant(["connected to the rest only through a photo that contradicts it"])[1]
     with pytest.raises(ValueError, match="no reasons"):

@@ -102,6 +102,8 @@ def test_every_file_is_registered_or_has_its_reason(solved: Solved):
     assert all(images[name].registered and images[name].reason is None for name in NAMES)
     assert images["notes.jpg"].reason == "unreadable: not a readable picture"
     assert images["wall.png"].reason == "too few features (0 in 480x360 pixels)"
+    # It matches nothing, so no other start of the mapper could place it.
+    assert [attempt["models"] for attempt in solved.report.attempts] == [[7]]
     assert (solved.report.registered, solved.report.total) == (7, 10)
     assert "notes.jpg is skipped: not a readable picture" in solved.notes
     assert is_same_scene(solved.scene, solved.photos, FAST)
@@ -134,11 +136,6 @@ def test_the_report_file_has_the_promised_keys(solved: Solved):
     assert report["search"] == {"max_image_size": 384, "max_features": 500}
     assert report["versions"]["pycolmap"] == pycolmap.__version__
     assert report["matching"] == {"rule": "retrieval", "pairs": 25, **hash_inputs(solved.photos, FAST)}
-
-
-def test_a_blank_photo_costs_no_second_attempt(solved: Solved):
-    """It matches nothing, so no other start of the mapper could place it."""
-    assert [attempt["models"] for attempt in solved.report.attempts] == [[7]]
 
 
 def test_progress_goes_through_all_stages(solved: Solved):
@@ -230,12 +227,19 @@ def test_a_full_disk_is_reported_even_where_no_log_could_be_written(log: str, fr
     assert "run the same command again to continue" in reported.hint
 
 
-def test_a_scene_never_takes_the_place_of_the_photos(tmp_path: Path):
+def test_a_scene_never_takes_the_place_of_photos_or_of_something_else(tmp_path: Path):
     write_noise(tmp_path / "photos")
-    for destination in (tmp_path / "photos", tmp_path):
-        with pytest.raises(UserError, match="would overwrite the photos"):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
+    for destination, said in (
+        (tmp_path / "photos", "would overwrite the photos"),
+        (tmp_path, "would overwrite the photos"),
+        (tmp_path / "thesis", "the folder contains other files"),
+    ):
+        with pytest.raises(UserError, match=said):
             estimate_poses(tmp_path / "photos", destination, settings=FAST)
     assert len(list((tmp_path / "photos").iterdir())) == 5
+    assert (tmp_path / "thesis" / "chapter.tex").is_file()
 
 
 def test_a_folder_that_cannot_be_written_is_refused_before_photos_are_read(
@@ -247,15 +251,6 @@ def test_a_folder_that_cannot_be_written_is_refused_before_photos_are_read(
         estimate_poses(
             tmp_path / "photos", tmp_path / "scene", settings=FAST, progress=Mock(side_effect=AssertionError)
         )
-
-
-def test_a_folder_that_is_no_scene_is_not_replaced(tmp_path: Path):
-    write_noise(tmp_path / "photos")
-    (tmp_path / "thesis").mkdir()
-    (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
-    with pytest.raises(UserError, match="the folder contains other files"):
-        estimate_poses(tmp_path / "photos", tmp_path / "thesis", settings=FAST)
-    assert (tmp_path / "thesis" / "chapter.tex").is_file()
 
 
 @pytest.mark.parametrize(

@@ -145,10 +145,8 @@ def test_runs_are_shown_by_photos_that_all_of_them_hold_out():
     def holding(*names: str) -> RunFacts:
         return facts(frames=RunCameras((), tuple(camera_at(name, (0, 0, -2)) for name in names)))
 
-    assert common_names([holding("a.png", "b.png", "c.png"), holding("c.png", "a.png", "d.png")], 8) == [
-        "a.png",
-        "c.png",
-    ]
+    both = [holding("a.png", "b.png", "c.png"), holding("c.png", "a.png", "d.png")]
+    assert common_names(both, 8) == ["a.png", "c.png"]
     assert common_names([holding("a.png"), holding("b.png")], 8) == []
 
 
@@ -161,17 +159,9 @@ def layers_in(page: str) -> list[list[dict[str, Any]]]:
 def test_the_page_shows_the_numbers_and_embeds_the_pictures(seen):
     look, _ = seen
     text = page_html([facts()], [look], depths=[_meta()])
-    for reported in (
-        "23.46 dB",
-        "0.7500",
-        "1.50 M",
-        "0.25 s",
-        "8.0 MB",
-        "200 MB",
-        "conditional depth along the optical",
-        ">20<",
-    ):
-        assert reported in text
+    for number in ("23.46 dB", "0.7500", "1.50 M", "0.25 s", "8.0 MB", "200 MB", ">20<"):
+        assert number in text
+    assert "conditional depth along the optical" in text
     assert not re.search(r"(src|href)=\"?http", text)
     layers = layers_in(text)
     assert [layer["label"] for layer in layers[0]] == ["photo", "rendered", "error", "depth", "coverage"]
@@ -273,17 +263,10 @@ def test_the_page_shows_cameras_chosen_components_and_how_new_the_views_are(seen
         run, metrics=metrics, config=replace(run.config, selection=Selection(Components(), (decision,), 1.0))
     )
     text = page_html([chosen], [look], depths=[_meta()])
-    for reported in (
-        "0.123",
-        "5.7",
-        "extrapolation",
-        "all photos were matched",
-        "19.50 dB (3)",
-        "view=0",
-        "+0.50 ± 0.10",
-        "-2%",
-    ):
-        assert reported in text
+    for cell in ("0.123", "5.7", "extrapolation", "all photos were matched", "19.50 dB (3)"):
+        assert cell in text
+    for cell in ("view=0", "+0.50 ± 0.10", "-2%"):
+        assert cell in text
     assert "view=0" not in page_html([run], [look], depths=[_meta()])
 
 
@@ -312,13 +295,9 @@ def test_everything_that_was_warned_about_is_listed():
     run.log.append(logged(30, 0.01, rollbacks=2))
     reported = [f"{stage}: {text}" for stage, text in warnings_of(run)]
     for part in (
-        *(
-            "c.png (too few matches)",
-            "poses: implausible: the focal length is 9 times the width",
-            "2 attempts",
-            "poses: two sides may look alike",
-            "d.png is uncertain by 3.2 px",
-        ),
+        "poses: two sides may look alike",
+        "poses: implausible: the focal length is 9 times the width",
+        *("c.png (too few matches)", "2 attempts", "d.png is uncertain by 3.2 px"),
         *("e.png", "intrinsics were halved", "non-finite 2 times", "nerfcli evaluate"),
     ):
         assert sum(part in text for text in reported) == 1, part
