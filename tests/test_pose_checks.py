@@ -236,11 +236,11 @@ def mapped(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def estimated(photos: Path, mapped: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PosesReport]:
-    """The scene of these photos, and what was reported."""
+def report(photos: Path, mapped: Path, tmp_path_factory: pytest.TempPathFactory) -> PosesReport:
+    """The report on these photos."""
     scene = shutil.copytree(mapped, tmp_path_factory.mktemp("estimated") / "scene")
     with worker_in_this_process():
-        return scene, estimate(photos, scene)[0]
+        return estimate(photos, scene)[0]
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="POSIX signals")
@@ -323,15 +323,11 @@ def test_a_refused_model_stays_and_can_be_accepted(
     assert len(load_scene(scene).frames) == len(NAMES)
 
 
-def test_closing_notes_name_components_and_checks(estimated: tuple[Path, PosesReport]):
-    _, report = estimated
-    first = report.components[0]
-    two = replace(
-        report,
-        components=(first, {"size": 2, "photos": ["x.jpg", "y.jpg"], "apart": "no photo of it matches"}),
-        not_computed={"pose uncertainty": "ValueError: singular"},
-        attempts=(*report.attempts, {"what": "only a part", "models": [4], "doubt": "two sides may look alike"}),
-    )
+def test_closing_notes_name_components_and_checks(report: PosesReport):
+    other = {"size": 2, "photos": ["x.jpg", "y.jpg"], "apart": "no photo of it matches"}
+    not_computed = {"pose uncertainty": "ValueError: singular"}
+    attempts = (*report.attempts, {"what": "only a part", "models": [4], "doubt": "two sides may look alike"})
+    two = replace(report, components=(report.components[0], other), not_computed=not_computed, attempts=attempts)
     assert closing_notes(two) == [
         "2 photos (x.jpg ... y.jpg) form a model of their own: no photo of it matches; estimate their poses separately",
         "two sides may look alike",
@@ -339,8 +335,7 @@ def test_closing_notes_name_components_and_checks(estimated: tuple[Path, PosesRe
     ]
 
 
-def test_a_lens_without_distortion_has_no_uncertainty_of_it(estimated: tuple[Path, PosesReport]):
-    _, report = estimated
+def test_a_lens_without_distortion_has_no_uncertainty_of_it(report: PosesReport):
     certain = {"weak": True, "focal_percent": 15.34, "distortion_border_px": None}
 
     def note(uncertainty: Mapping[str, object]) -> str:
@@ -368,28 +363,24 @@ def test_photos_without_features_and_a_failing_search_for_motions_end_nothing(
     assert f"could not check for an object moving in front of a static background: {why}" in notes
 
 
-def test_a_refusal_speaks_of_as_many_photos_as_are_missing(photos: Path, estimated: tuple[Path, PosesReport]):
-    _, report = estimated
+def test_a_refusal_speaks_of_as_many_photos_as_are_missing(photos: Path, report: PosesReport):
     there = [replace(image, registered=True, reason=None) for image in report.images[:4]]
     missing = replace(there[0], registered=False, reason="matches no other photo well (best 0 verified matches)")
 
-    def said(registered: int) -> str:
+    for registered, said in (
+        (3, "only 3 of 4 photos"),
+        (3, "; the other:"),
+        (2, "; most of the others:"),
+        (0, "; most of them:"),
+    ):
         images = (*there[:registered], *[missing] * (4 - registered))
-        refused = refusal(replace(report, registered=registered, total=4, images=images, parts=(4,)), photos)
-        return str(refused)
-
-    assert "only 3 of 4 photos registered" in said(3)
-    assert "; the other: matches no other photo well" in said(3)
-    assert "; most of the others: matches no other photo well" in said(2)
-    assert "; most of them: matches no other photo well" in said(0)
+        refused = str(refusal(replace(report, registered=registered, total=4, images=images, parts=(4,)), photos))
+        assert said in refused
+        assert ": matches no other photo well" in refused
 
 
-def test_only_parts_that_are_large_enough_are_worth_processing(photos: Path, estimated: tuple[Path, PosesReport]):
-    _, report = estimated
-
-    def hint(*parts: int) -> str | None:
-        refused = refusal(replace(report, registered=3, total=sum(parts), parts=parts), photos)
-        return refused.hint if refused else None
-
-    assert hint(3, 3) == "take photos that connect the parts"
-    assert hint(5, 4) == "take photos that connect the parts, or process each part separately"
+@pytest.mark.parametrize(("parts", "more"), [((3, 3), ""), ((5, 4), ", or process each part separately")])
+def test_only_parts_that_are_large_enough_are_worth_processing(photos: Path, report: PosesReport, parts, more):
+    refused = refusal(replace(report, registered=3, total=sum(parts), parts=parts), photos)
+    assert refused is not None
+    assert refused.hint == f"take photos that connect the parts{more}"

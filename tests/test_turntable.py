@@ -21,7 +21,7 @@ from nerfcli.cameras.alignment import align
 from nerfcli.captures.loading import load_scene
 from nerfcli.doctor.examination import Diagnosis, examine, find_subject
 from nerfcli.errors import UserError
-from nerfcli.matching.stationary import Motions, Stationary, motions, still_px, together
+from nerfcli.matching.stationary import Motions, motions, still_px, together
 from nerfcli.pages.findings import LOOK
 from nerfcli.poses.engine import turntable as module
 from nerfcli.poses.engine.turntable import add_advice, describe_motions, mask_turning_object, recall_masks, scene_masks
@@ -73,9 +73,7 @@ class TestMotions:
     def test_background_that_stays_and_object_that_turns_are_two_motions(self, still_count: int) -> None:
         for i, j, moving in ring_pairs():
             found = both(moving, staying(still_count, seed=i + j))
-            assert found.two
-            assert not found.only_still
-            assert not found.one
+            assert (found.two, found.only_still, found.one) == (True, False, False)
             assert abs(found.still - still_count) <= 0.05 * still_count + 6  # some points of the object are on its axis
             assert found.moving > 0.6 * len(moving[0])
             assert found.agreeing < 0.6
@@ -88,8 +86,7 @@ class TestMotions:
 
     def test_copies_of_a_photo_are_no_two_motions(self) -> None:
         found = motions(*staying(400, seed=0), SIZE)
-        assert found.only_still
-        assert not found.two
+        assert (found.only_still, found.two) == (True, False)
 
     def test_what_is_far_away_agrees_with_a_camera_that_moves_sideways(self) -> None:
         """The horizon stays while the camera slides past what is near: one motion."""
@@ -158,27 +155,19 @@ class TestMotions:
 
 class TestTogether:
     @staticmethod
-    def of(box: tuple[float, float, float, float], *, copies: int = 0) -> Stationary:
-        pairs = [both(moving, staying(60, seed=i + j, box=box)) for i, j, moving in ring_pairs()]
-        return together([*pairs, *(motions(*staying(200, seed=i), SIZE) for i in range(copies))])
-
-    def test_background_around_an_object_is_found(self) -> None:
-        said = self.of((0, 0, 1, 1))
-        assert said.found
-        assert said.fraction == 1
+    def of(box: tuple[float, float, float, float]) -> list[Motions]:
+        return [both(moving, staying(60, seed=i + j, box=box)) for i, j, moving in ring_pairs()]
 
     @pytest.mark.parametrize("box", [(0.75, 0.93, 0.99, 0.99), (0.0, 0.94, 1.0, 1.0), (0.85, 0.02, 0.98, 0.15)])
     def test_time_stamp_or_mark_is_no_background(self, box: tuple[float, float, float, float]) -> None:
-        said = self.of(box)
-        assert said.two_motions
-        assert not said.wide
-        assert not said.found
+        said = together(self.of(box))
+        assert (said.two_motions, said.wide, said.found) == (True, False, False)
 
-    def test_copies_neither_make_nor_hide_it(self) -> None:
-        assert self.of((0, 0, 1, 1), copies=40).found
-        copies = together([motions(*staying(200, seed=i), SIZE) for i in range(40)])
-        assert not copies.found
-        assert copies.fraction == 0
+    def test_background_around_an_object_is_found_and_copies_neither_make_nor_hide_it(self) -> None:
+        around, copies = self.of((0, 0, 1, 1)), [motions(*staying(200, seed=i), SIZE) for i in range(40)]
+        for pairs, found, fraction in ((around, True, 1), (around + copies, True, 1), (copies, False, 0)):
+            said = together(pairs)
+            assert (said.found, said.fraction) == (found, fraction)
 
     def test_few_such_pairs_among_others_are_not_enough(self) -> None:
         pairs = [motions(*moving, SIZE) for _, _, moving in ring_pairs()]
@@ -200,21 +189,20 @@ class TestMasks:
         rows, columns = np.nonzero(~capture.masks.any(axis=0))
         return np.column_stack([columns / width, rows / height])
 
-    def check(self, capture: Turntable, pictures: list[np.ndarray], *, cut: float = 0.03, extra: float = 0.03) -> None:
-        self.check_displaced(capture.masks, pictures, [np.eye(2, 3)] * len(pictures), capture, cut=cut, extra=extra)
-
-    def check_displaced(
+    def check(
         self,
-        truths: Sequence[np.ndarray] | np.ndarray,
-        pictures: list[np.ndarray],
-        placed: list[np.ndarray],
         capture: Turntable,
+        pictures: list[np.ndarray],
         *,
-        cut: float = 0.03,
-        extra: float = 0.03,
+        cut: float,
+        extra: float,
+        placed: Sequence[np.ndarray] = (),
     ) -> None:
+        """Check masks of pictures that are placed in the capture's by similarities."""
+        placed = placed or [np.eye(2, 3)] * len(pictures)
         behind = still.background(pictures, placed, self.around(capture))
-        for picture, similarity, truth in zip(pictures, placed, truths, strict=True):
+        for picture, similarity, mask in zip(pictures, placed, capture.masks, strict=True):
+            truth = cv2.warpAffine(mask.astype(np.uint8), similarity, mask.shape[::-1]) > 0
             size = (truth.shape[1], truth.shape[0])
             found = still.enlarged(still.differs(picture, behind.seen_with(similarity, size)), size)
             assert (truth & ~found).sum() < cut * truth.sum()
@@ -223,24 +211,18 @@ class TestMasks:
     def test_photos_may_be_displaced(self, capture: Turntable) -> None:
         """Each photo is moved and turned by known amounts; what comes in from outside the picture is grey noise."""
         rng = np.random.default_rng(3)
-        placed, pictures, truths = [], [], []
-        for photo, mask in zip(capture.photos, capture.masks, strict=True):
+        placed, pictures = [], []
+        for photo in capture.photos:
             similarity = cv2.getRotationMatrix2D((240, 180), rng.uniform(-1.5, 1.5), 1.0)
             similarity[:, 2] += rng.uniform(-25, 25, size=2)
             placed.append(similarity)
             pictures.append(cv2.warpAffine(photo, similarity, (480, 360), borderMode=cv2.BORDER_REFLECT))
-            truths.append(cv2.warpAffine(mask.astype(np.uint8), similarity, (480, 360)) > 0)
-        self.check_displaced(truths, pictures, placed, capture, cut=0.05, extra=0.05)
+        self.check(capture, pictures, cut=0.05, extra=0.05, placed=placed)
 
-    def test_masks_hold_the_object_and_little_else(self, capture: Turntable) -> None:
-        self.check(capture, [still.small(photo) for photo in capture.photos])
-
-    def test_light_that_changes_from_photo_to_photo_changes_little(self, capture: Turntable) -> None:
-        rng = np.random.default_rng(0)
-        gains = rng.uniform(0.8, 1.1, size=len(capture.photos))
-        brighter = [
-            np.clip(photo * gain, 0, 255).astype(np.uint8) for photo, gain in zip(capture.photos, gains, strict=True)
-        ]
+    def test_masks_hold_the_object_and_little_else_whatever_the_light_of_each_photo(self, capture: Turntable) -> None:
+        self.check(capture, [still.small(photo) for photo in capture.photos], cut=0.03, extra=0.03)
+        gains = np.random.default_rng(0).uniform(0.8, 1.1, size=(len(capture.photos), 1, 1, 1))
+        brighter = np.clip(capture.photos * gains, 0, 255).astype(np.uint8)
         self.check(capture, [still.small(photo) for photo in brighter], cut=0.05, extra=0.06)
 
 
