@@ -129,16 +129,14 @@ def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Findi
             stays = ", fixed in the image" if patch.still else ""
             where = f"at {across:.0f} % across, {down:.0f} % down{stays}"
             moving_photos.append((patch.matches, photos[photo].name, where))
-    threshold = "look from 1 photo, bad from half of them"
-    if not moving_photos:
-        return Finding("moving content", GOOD, "none found", 0.0, threshold)
-    fraction = len(moving_photos) / len(photos)
+    fraction, threshold = len(moving_photos) / len(photos), "look from 1 photo, bad from half of them"
     advice = "mask it: moving objects become fog, and disturb poses"
     if still:
         advice += "; content fixed in the image is a watermark, a strap, or the background of a turntable"
-    summary = f"independent movement in {several(len(moving_photos), 'photo')}"
-    remarks = tuple((name, what) for _, name, what in sorted(moving_photos, reverse=True))
-    return Finding("moving content", BAD if fraction >= 0.5 else LOOK, summary, fraction, threshold, advice, remarks)
+    summary = f"independent movement in {several(len(moving_photos), 'photo')}" if moving_photos else "none found"
+    remarks = ((name, what) for _, name, what in sorted(moving_photos, reverse=True))
+    verdict = BAD if fraction >= 0.5 else LOOK if moving_photos else GOOD
+    return finding("moving content", verdict, summary, fraction, threshold, advice=advice, photos=remarks)
 
 
 def turning_object(pairs: Sequence[Pair]) -> Finding | None:

@@ -9,7 +9,7 @@ import numpy as np
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.errors import several
-from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, verdict_above, verdict_below
+from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, finding, verdict_above, verdict_below
 from nerfcli.photos.focal_evidence import focal_evidence, same_focal
 from nerfcli.poses.input.photos import MIN_PHOTOS
 
@@ -59,10 +59,10 @@ def size(photos: Sequence[PhotoFacts]) -> Finding:
     listed += f" and {len(sizes) - 3} other sizes" if len(sizes) > 3 else ""
     verdict = verdict_below(smallest, look=SMALL_PX, bad=SMALL_PX // 2)
     small = sorted((side, photo.name) for photo, side in zip(photos, longer, strict=True) if side < SMALL_PX)
-    remarks = tuple((name, f"{side} px") for side, name in small)
+    remarks = ((name, f"{side} px") for side, name in small)
     threshold = f"longer side: look below {SMALL_PX} px, bad below {SMALL_PX // 2} px"
-    advice = "" if verdict == GOOD else "use the original files, not previews or downloads from a messenger"
-    return Finding("size", verdict, listed, smallest, threshold, advice, remarks)
+    advice = "use the original files, not previews or downloads from a messenger"
+    return finding("size", verdict, listed, smallest, threshold, advice=advice, photos=remarks)
 
 
 def cameras(photos: Sequence[PhotoFacts]) -> Finding:
@@ -90,7 +90,7 @@ def cameras(photos: Sequence[PhotoFacts]) -> Finding:
     summary = f"{kinds}{'; most photos' if most > 1 else ''}: {'; '.join(dict.fromkeys(main))}"
     threshold = "combinations: look from 2, bad from one per four photos"
     advice = "use one lens and one zoom setting, without cropping; each combination is calibrated separately"
-    return Finding("cameras", verdict, summary, most, threshold, "" if verdict == GOOD else advice, tuple(others))
+    return finding("cameras", verdict, summary, most, threshold, advice=advice, photos=others)
 
 
 def focal_length(photos: Sequence[PhotoFacts]) -> Finding:
@@ -112,14 +112,12 @@ def focal_length(photos: Sequence[PhotoFacts]) -> Finding:
         summary = "in EXIF in millimetres, without the size of the sensor; structure from motion will estimate it"
     else:
         summary = "not in EXIF; structure from motion will estimate it"
-    threshold = "look from 1 photo whose EXIF is for another aspect ratio"
-    if not doubtful:
-        return Finding("focal length", GOOD, summary, 0, threshold)
+    verdict, threshold = LOOK if doubtful else GOOD, "look from 1 photo whose EXIF is for another aspect ratio"
     advice = (
         "use the original files, or give --intrinsics: EXIF's focal length is not used, and a crop may shift the "
         "principal point"
     )
-    return Finding("focal length", LOOK, summary, len(doubtful), threshold, advice, tuple(doubtful))
+    return finding("focal length", verdict, summary, len(doubtful), threshold, advice=advice, photos=doubtful)
 
 
 def orientation(photos: Sequence[PhotoFacts]) -> Finding:

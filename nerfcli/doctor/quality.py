@@ -79,15 +79,14 @@ def texture(photos: Sequence[PhotoFacts]) -> Finding:
     """Check whether the photos have enough features to match."""
     threshold = "look from 1 photo with fewer than 150 features, bad from 30 % of the photos"
     poor = sorted((photo for photo in photos if len(photo.features.pixels) < 150), key=lambda p: len(p.features.pixels))
-    if not poor:
-        return Finding("texture", GOOD, "enough in every photo", 0.0, threshold)
-    fraction, summary = len(poor) / len(photos), f"{several(len(poor), 'photo')} with very few features"
-    remarks = tuple(
+    summary = f"{several(len(poor), 'photo')} with very few features" if poor else "enough in every photo"
+    remarks = (
         (p.name, f"{len(p.features.pixels)} features, texture on {100 * p.sharpness.textured:.0f} % of the image")
         for p in poor
     )
-    verdict, advice = verdict_above(fraction, look=1e-9, bad=0.3), "step back, or include textured objects"
-    return Finding("texture", verdict, summary, fraction, threshold, advice, remarks)
+    fraction, advice = len(poor) / len(photos), "step back, or include textured objects"
+    verdict = verdict_above(fraction, look=1e-9, bad=0.3)
+    return finding("texture", verdict, summary, fraction, threshold, advice=advice, photos=remarks)
 
 
 def stops(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray]:
@@ -179,10 +178,9 @@ def clipping(photos: Sequence[PhotoFacts]) -> Finding:
         f"per photo: look from {100 * CLIPPED_LOOK:g} % of its pixels, bad from {100 * CLIPPED_BAD:g} %; all: bad "
         "from 30 % of the photos"
     )
-    if not flagged:
-        return Finding("clipping", GOOD, "little", 0.0, threshold)
-    verdict = BAD if verdicts.count(BAD) >= 0.3 * len(photos) else LOOK
-    summary = f"{several(len(flagged), 'photo')} of {len(photos)} with large pure white or black areas, or dark"
+    verdict = BAD if verdicts.count(BAD) >= 0.3 * len(photos) else LOOK if flagged else GOOD
+    large = f"{several(len(flagged), 'photo')} of {len(photos)} with large pure white or black areas, or dark"
     advice = "expose so that the subject is neither white nor black, which cannot be matched; a background may be"
-    remarks = tuple((name, what) for _, name, what in sorted(flagged, key=lambda item: -item[0]))
-    return Finding("clipping", verdict, summary, len(flagged) / len(photos), threshold, advice, remarks)
+    remarks = ((name, what) for _, name, what in sorted(flagged, key=lambda item: -item[0]))
+    summary, fraction = large if flagged else "little", len(flagged) / len(photos)
+    return finding("clipping", verdict, summary, fraction, threshold, advice=advice, photos=remarks)

@@ -66,8 +66,13 @@ def match(photos: Sequence[LoadedPhoto], *, threads: int) -> tuple[Matches, ...]
     try:
         with ThreadPoolExecutor(max(1, threads)) as pool:
             features = dict(zip(wanted, pool.map(lambda index: _features(photos[index]), wanted), strict=True))
-            found = pool.map(lambda pair: _in_common(pair, (features[pair[0]], features[pair[1]])), pairs)
-            return tuple(matches for matches in found if len(matches.pixels[0]))
+
+            def in_common(pair: tuple[int, int]) -> Matches:
+                one, other = (features[index] for index in pair)
+                a, b = mutual_matches(one.descriptors, other.descriptors)
+                return Matches(pair, (one.pixels[a], other.pixels[b]))
+
+            return tuple(matches for matches in pool.map(in_common, pairs) if len(matches.pixels[0]))
     finally:
         cv2.setNumThreads(own_threads)
 
@@ -91,12 +96,6 @@ def chosen_pairs(photos: Sequence[LoadedPhoto]) -> list[tuple[int, int]]:
 def _features(photo: LoadedPhoto) -> Features:
     grey = cv2.cvtColor(np.ascontiguousarray(photo.pixels[..., :3]), cv2.COLOR_RGB2GRAY)
     return find_features(grey, longer_side_px=LONGER_SIDE_PX, most=1500, used=photo.used)
-
-
-def _in_common(pair: tuple[int, int], features: tuple[Features, Features]) -> Matches:
-    one, other = features
-    a, b = mutual_matches(one.descriptors, other.descriptors)
-    return Matches(pair, (one.pixels[a], other.pixels[b]))
 
 
 def radians_per_pixel(camera: Camera) -> float:

@@ -149,15 +149,17 @@ def _geometry(model: pycolmap.Reconstruction) -> dict[str, Any]:
         by_count.setdefault(len(seen), []).append((point.xyz, seen))
     angles, distances, in_front, observations = [], [], 0, 0
     # A million cosines between directions to points are in memory at a time.
-    for part in (part for count, alike in by_count.items() for part in _parts(alike, 2**20 // count**2)):
-        positions, seen_by = (np.array(each) for each in zip(*part, strict=True))  # (n, 3) and (n, photos)
-        to = positions[:, None] - centres[seen_by]
-        lengths = np.linalg.norm(to, axis=2)
-        directions = to / np.maximum(lengths, 1e-300)[..., None]
-        angles.append(np.arccos(np.clip((directions @ directions.swapaxes(1, 2)).min(axis=(1, 2)), -1, 1)))
-        distances.append(np.median(lengths, axis=1))
-        in_front += int((wide[seen_by] | ((directions * forward[seen_by]).sum(axis=2) > 0)).sum())
-        observations += seen_by.size
+    for count, alike in by_count.items():
+        step = max(1, 2**20 // count**2)
+        for part in (alike[first : first + step] for first in range(0, len(alike), step)):
+            positions, seen_by = (np.array(each) for each in zip(*part, strict=True))  # (n, 3) and (n, photos)
+            to = positions[:, None] - centres[seen_by]
+            lengths = np.linalg.norm(to, axis=2)
+            directions = to / np.maximum(lengths, 1e-300)[..., None]
+            angles.append(np.arccos(np.clip((directions @ directions.swapaxes(1, 2)).min(axis=(1, 2)), -1, 1)))
+            distances.append(np.median(lengths, axis=1))
+            in_front += int((wide[seen_by] | ((directions * forward[seen_by]).sum(axis=2) > 0)).sum())
+            observations += seen_by.size
     middle = np.mean(centres, axis=0)
     spread = np.sqrt(np.mean(np.sum((centres - middle) ** 2, axis=1)))
     return {
@@ -165,12 +167,6 @@ def _geometry(model: pycolmap.Reconstruction) -> dict[str, Any]:
         "share_in_front": in_front / observations if observations else None,
         "camera_spread_over_distance": float(spread / np.median(np.concatenate(distances))) if distances else None,
     }
-
-
-def _parts(items: list[Any], length: int) -> list[list[Any]]:
-    """Cut a list into parts of a length, of one item at least."""
-    step = max(1, length)
-    return [items[first : first + step] for first in range(0, len(items), step)]
 
 
 def _cameras_in_use(model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
