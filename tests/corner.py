@@ -1,7 +1,7 @@
 """A room corner of three textured walls, rendered with known poses: a small capture for structure from motion.
 
-It has the irregularities of real folders: photos stored on their side, photos of a second size, a blank photo, a text
-file, names with spaces.
+It has the irregularities of real folders: photos stored on their side, photos of a second size, a blank photo, names
+with spaces.
 """
 
 from functools import cache
@@ -73,11 +73,8 @@ def render(centre: np.ndarray, scale: float, shift: np.ndarray) -> np.ndarray:
     return image
 
 
-def write_capture(folder: Path, shifts: np.ndarray = np.zeros((len(NAMES), 2))) -> None:
-    """Write the seven views, a blank photo and a text file named like a photo.
-
-    `shifts` (7, 2) are those of the views' principal points, see `render`.
-    """
+def write_capture(folder: Path, shifts: np.ndarray = np.zeros((len(NAMES), 2))) -> Path:
+    """Write the seven views, with shifts (7, 2) of their principal points, and a blank photo; return the folder."""
     folder.mkdir()
     for index, name in enumerate(NAMES):
         picture = Image.fromarray(render(CENTRES[index], 0.8 if index in SMALLER else 1.0, shifts[index]))
@@ -87,4 +84,4 @@ def write_capture(folder: Path, shifts: np.ndarray = np.zeros((len(NAMES), 2))) 
             exif[0x0112] = 6
         picture.save(folder / name, quality=97, exif=exif)
     Image.new("RGB", (WIDTH, HEIGHT), (200, 200, 200)).save(folder / "wall.png")
-    (folder / "notes.jpg").write_text("this is text")
+    return folder

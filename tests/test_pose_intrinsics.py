@@ -51,10 +51,8 @@ def worst_centre(scene: Path) -> float:
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("capture") / "my photos"
-    write_capture(folder)
-    for name in ("notes.jpg", "wall.png"):
-        (folder / name).unlink()
+    folder = write_capture(tmp_path_factory.mktemp("capture") / "my photos")
+    (folder / "wall.png").unlink()
     return folder
 
 

@@ -81,10 +81,7 @@ def same_process() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("capture") / "my photos"
-    write_capture(folder)
-    (folder / "notes.jpg").unlink()
-    return folder
+    return write_capture(tmp_path_factory.mktemp("capture") / "my photos")
 
 
 @pytest.fixture(scope="module")

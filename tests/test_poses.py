@@ -44,8 +44,8 @@ class Solved:
 @pytest.fixture(scope="module")
 def solved(tmp_path_factory: pytest.TempPathFactory) -> Solved:
     folder = tmp_path_factory.mktemp("capture")
-    photos, scene_dir = folder / "my photos", folder / "corner"
-    write_capture(photos)
+    photos, scene_dir = write_capture(folder / "my photos"), folder / "corner"
+    (photos / "notes.jpg").write_text("this is text")
     (photos / "view 7.cr3").write_bytes(b"raw")
     notes: list[str] = []
     stages: list[tuple[str, int, int]] = []
