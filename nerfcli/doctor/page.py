@@ -27,7 +27,8 @@ def page_html(diagnosis: Diagnosis) -> str:
     order = sorted(findings, key=lambda finding: -VERDICTS.index(finding.verdict))
     counts = {which: sum(finding.verdict == which for finding in order) for which in VERDICTS}
     concerned = [[f for f in findings if photo.name in f.names and f.verdict != GOOD] for photo in photos]
-    title = _title(diagnosis.subject.path)
+    folder = diagnosis.subject.path.resolve()
+    title = f"{folder.parent.name}/{folder.name}" if folder.name in ("images", "photos") else folder.name
     body = page.rendered(
         "doctor.html",
         title=title,
@@ -51,11 +52,6 @@ def page_html(diagnosis: Diagnosis) -> str:
         style=f"{page.asset('doctor.css')}{thumbnails}\n",
         body=body,
     )
-
-
-def _title(capture: Path) -> str:
-    folder = capture.resolve()
-    return f"{folder.parent.name}/{folder.name}" if folder.name in ("images", "photos") else folder.name
 
 
 def _charts(diagnosis: Diagnosis) -> Iterator[tuple[str, str, Markup]]:

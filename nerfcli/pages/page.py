@@ -93,17 +93,12 @@ def _templates() -> "Environment":
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["sentence"] = _sentence
-    environment.filters["file_name"] = _file_name
+    filters: dict[str, Any] = {
+        "sentence": lambda text: text[:1].upper() + text[1:] + ".",
+        "file_name": lambda name: name.replace("\\", "/").rpartition("/")[2],
+    }
+    environment.filters |= filters
     return environment
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:] + "."
-
-
-def _file_name(name: str) -> str:
-    return name.replace("\\", "/").rpartition("/")[2]
 
 
 def data_element(name: str, content: Any) -> Markup:

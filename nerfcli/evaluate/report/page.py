@@ -12,13 +12,13 @@ from nerfcli.atomic import digest
 from nerfcli.cameras.frame import Frame
 from nerfcli.evaluate.report.run_facts import RunFacts, captures_of, mismatches_of, scenes_of, warnings_of
 from nerfcli.evaluate.report.tables import (
-    capture_table,
+    CAPTURE,
+    NUMBERS,
+    columns_table,
     last_logged,
     ledger_table,
     measured,
-    numbers_table,
     photo_tables,
-    protocols_of,
     registered,
     selection_table,
     settings_table,
@@ -29,7 +29,6 @@ from nerfcli.evaluate.report.views import (
     ERROR_COLOURS,
     ERROR_RANGE,
     HeldOutRenderings,
-    coverage_picture,
     depth_range,
 )
 from nerfcli.pages import figures, page
@@ -91,14 +90,14 @@ def page_html(
         runs=[(run.label, figures.COLOURS[index % len(figures.COLOURS)]) for index, run in enumerate(runs)],
         warnings=_warnings(runs),
         overview=_overview(runs, looks) if len(captures_of(runs)) > 1 else None,
-        numbers=numbers_table(runs),
-        protocols=protocols_of(runs),
+        numbers=columns_table(runs, NUMBERS),
+        protocols=list(dict.fromkeys(run.metrics.protocol for run in runs if run.metrics)),
         views=views,
         layers=page.data_element("views", layers),
         legends=list(_legends(runs, ranges, depths)),
         charts=list(_charts(runs)),
         photos=photo_tables(runs),
-        capture=capture_table(runs),
+        capture=columns_table(runs, CAPTURE),
         cameras=_cameras(runs),
         selection=selection_table(runs),
         ledger=ledger_table(runs),
@@ -181,13 +180,13 @@ def _layers(
     def layer(kind: str, run: RunFacts, picture: np.ndarray) -> dict[str, str]:
         return _layer(kind if alone else f"{run.label}: {kind}", picture)
 
-    depths = [(run, coloured(view.depth, colours, DEPTH_COLOURS)) for run, view, colours in seen]
+    counts = ColourRange(0.0, float(COVERAGE_RANGE))
     return [
         _layer("photo", first.photo),
         *(layer("rendered", run, view.picture) for run, view, _ in seen),
         *(layer("error", run, view.error) for run, view, _ in seen),
-        *(layer("depth", run, picture) for run, picture in depths),
-        *(layer("coverage", run, coverage_picture(view.coverage)) for run, view, _ in seen),
+        *(layer("depth", run, coloured(view.depth, colours, DEPTH_COLOURS)) for run, view, colours in seen),
+        *(layer("coverage", run, coloured(view.coverage, counts, COVERAGE_COLOURS)) for run, view, _ in seen),
     ]
 
 

@@ -11,26 +11,11 @@ from nerfcli.pages.page import Table
 _MEGA = 1e6
 
 
-def numbers_table(runs: Sequence[RunFacts]) -> Table:
-    """Format the metrics of the runs."""
-    return _columns(runs, _NUMBERS)
-
-
-def capture_table(runs: Sequence[RunFacts]) -> Table:
-    """Format the captures of the runs and their poses."""
-    return _columns(runs, _CAPTURE)
-
-
-def _columns(runs: Sequence[RunFacts], rows: Sequence[tuple[str, Callable[[RunFacts], str]]]) -> Table:
-    """Return a table with a column for each run; rows that are empty for all runs are left out."""
+def columns_table(runs: Sequence[RunFacts], rows: Sequence[tuple[str, Callable[[RunFacts], str]]]) -> Table:
+    """Format rows, such as `NUMBERS`, with a column for each run; those that are empty for all runs are left out."""
     cells = [(name, *(read(run) for run in runs)) for name, read in rows]
     kept = [row for row in cells if any(row[1:])]
     return Table(("", *(run.label for run in runs)), kept, range(1, len(runs) + 1))
-
-
-def protocols_of(runs: Sequence[RunFacts]) -> list[str]:
-    """Return the evaluation protocols, each once."""
-    return list(dict.fromkeys(run.metrics.protocol for run in runs if run.metrics))
 
 
 def measured(read: Callable[[RunMetrics], float | None], form: str) -> Callable[[RunFacts], str]:
@@ -181,7 +166,8 @@ def _flat(content: dict[str, Any], prefix: str = "") -> dict[str, str]:
     return flat
 
 
-_NUMBERS: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
+# Metrics of a run.
+NUMBERS: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
     ("PSNR on held-out photos", measured(lambda found: found.mean.psnr, "{:.2f} dB")),
     ("SSIM", measured(lambda found: found.mean.ssim, "{:.4f}")),
     ("LPIPS", measured(lambda found: found.mean.lpips, "{:.4f}")),
@@ -204,8 +190,8 @@ _NUMBERS: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
     ("measured on", lambda run: run.metrics.device if run.metrics else ""),
 )
 
-
-_CAPTURE: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
+# A run's capture and its poses.
+CAPTURE: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
     ("scene", lambda run: run.config.scene.name),
     ("format", lambda run: run.config.scene_kind or ""),
     ("training photos", lambda run: str(len(run.frames.train))),

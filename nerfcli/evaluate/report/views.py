@@ -14,7 +14,7 @@ from nerfcli.render.coverage import DepthMap, small_frame, with_coverage
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
-from nerfcli.render.presentation import ColourRange, coloured
+from nerfcli.render.presentation import ColourRange
 
 # Mean absolute difference of the channels at the last colour of error maps, sRGB in [0, 1].
 ERROR_RANGE = 0.2
@@ -98,11 +98,6 @@ def _coverage_map(model: Model, frame: Frame, photo_depths: Sequence[DepthMap]) 
     seen = with_coverage(picture, small, axis=_COVERAGE.axis, photo_depths=photo_depths)
     assert seen.coverage is not None
     return seen.coverage
-
-
-def coverage_picture(coverage: np.ndarray) -> np.ndarray:
-    """Colour a map of coverage, as uint8 RGB; hatched where there is no surface."""
-    return coloured(coverage, ColourRange(0.0, float(COVERAGE_RANGE)), COVERAGE_COLOURS)
 
 
 def depth_range(views: Sequence[HeldOutRenderings]) -> ColourRange:

@@ -283,7 +283,8 @@ def _implausible(
         if camera.camera_id not in given and not _sees_behind(camera)
     }
     photos = Counter(lenses_of(model).values())
-    unusual = [camera_id for camera_id, focal in focals.items() if not _within(_FOCAL_RANGE, focal)]
+    (least, most), (lowest, highest) = _FOCAL_RANGE, _WIDER_FOCAL_RANGE
+    unusual = [camera_id for camera_id, focal in focals.items() if not least < focal < most]
     if sum(photos[camera_id] for camera_id in unusual) < _FEW * photos.total():
         determined = unusual
     advice = "give the intrinsics with --intrinsics, or use photos with EXIF data"
@@ -291,9 +292,5 @@ def _implausible(
     return failures + [
         Failure("the intrinsics are implausible", text.format(focals[camera_id]), advice)
         for camera_id in unusual
-        if camera_id not in determined or not _within(_WIDER_FOCAL_RANGE, focals[camera_id])
+        if camera_id not in determined or not lowest < focals[camera_id] < highest
     ]
-
-
-def _within(limits: tuple[float, float], value: float) -> bool:
-    return limits[0] < value < limits[1]
