@@ -35,7 +35,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.run_cameras import read_cameras
 from nerfcli.captures.loading import load_scene
 from nerfcli.evaluate.photos import HeldOutPhoto
-from nerfcli.evaluate.protocol import Extras, evaluate_model
+from nerfcli.evaluate.protocol import evaluate_model
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import load_model
 from nerfcli.training.loop import Progress, train
@@ -169,8 +169,8 @@ def fit(given: Capture, truth: Capture, choice: str, *, seed: int, steps: int, d
         replace(h, frame=replace(h.frame, world_from_cam=alignment.inverse().apply_pose(h.frame.world_from_cam)))
         for h in held_out
     ]
-    mean = evaluate_model(model, held_out, on_image=lambda done, total: None, extras=Extras()).mean
-    mapped = evaluate_model(model, there, on_image=lambda done, total: None, extras=Extras()).mean
+    mean = evaluate_model(model, held_out).mean
+    mapped = evaluate_model(model, there).mean
     turns = vector_from_rotation(np.swapaxes(pictures.truth[:, :3, :3], 1, 2) @ found[:, :3, :3])
     focal = [a.camera.focal_px / b.camera.focal_px - 1 for a, b in zip(cameras.train, truth.train_frames, strict=True)]
     return Trained(

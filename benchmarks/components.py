@@ -95,7 +95,7 @@ def fit(folder: Path, choice: str, *, seed: int, steps: int, downscale: int, sam
         trained = Run(Path(run))
         model, picked = trained.model(), differences(trained.components)
         held_out = held_out_photos(trained, capture.test_frames)
-    mean = evaluate_model(model, held_out, on_image=lambda done, total: None).mean
+    mean = evaluate_model(model, held_out).mean
     found = " ".join(f"{name}={value}" for name, value in picked.items())
     return Trained(folder.name, choice or "default", found, seed, steps, mean.psnr, mean.ssim or 0.0, used, samples)
 

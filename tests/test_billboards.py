@@ -23,10 +23,11 @@ from nerfcli.evaluate.billboards import (
     random_pixels,
 )
 from nerfcli.evaluate.photos import HeldOutPhoto
-from nerfcli.evaluate.protocol import Extras, evaluate_model
+from nerfcli.evaluate.protocol import evaluate_model
 from nerfcli.photos.colours import over_white, psnr_of, to_8_bit
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import load_model
+from nerfcli.render.pictures import Renderable
 
 CAMERA = Camera.pinhole(80, 60, 70.0)
 
@@ -185,38 +186,42 @@ def test_the_distance_of_a_round_wall_is_found():
     assert middle == pytest.approx([5.0, 5.0, 5.0], rel=0.2)
 
 
-def test_the_spheres_have_a_shape(spheres_run):
-    scene = load_scene(SPHERES)
-    photos = [over_white(photo.pixels) for photo in load_photos(scene.train_frames, factor=1, threads=1)]
-    held_out = [HeldOutPhoto(p.frame, p.pixels, p.used) for p in load_photos(scene.test_frames, factor=1, threads=1)]
-    metrics = evaluate_model(
-        load_model(spheres_run / "field.safetensors", "cpu"),
-        held_out,
-        on_image=lambda done, total: None,
-        extras=Extras(billboards=Billboards(scene.train_frames, photos)),
-    )
+@pytest.fixture
+def spheres_model(spheres_run) -> Renderable:
+    return load_model(spheres_run / "field.safetensors", "cpu")
+
+
+@pytest.fixture
+def spheres_billboards() -> Billboards:
+    frames = load_scene(SPHERES).train_frames
+    return Billboards(frames, [over_white(photo.pixels) for photo in load_photos(frames, factor=1, threads=1)])
+
+
+@pytest.fixture
+def held_out() -> list[HeldOutPhoto]:
+    photos = load_photos(load_scene(SPHERES).test_frames, factor=1, threads=1)
+    return [HeldOutPhoto(photo.frame, photo.pixels, photo.used) for photo in photos]
+
+
+def test_the_spheres_have_a_shape(spheres_model, spheres_billboards, held_out):
+    metrics = evaluate_model(spheres_model, held_out, billboards=spheres_billboards)
     assert metrics.shape is not None
     assert metrics.shape.shown
     assert metrics.shape.gain_db > 5
     assert metrics.shape.field_psnr == pytest.approx(metrics.mean.psnr, abs=0.5)
 
 
-def test_a_comparison_that_cannot_be_computed_ends_no_evaluation(spheres_run, monkeypatch: pytest.MonkeyPatch):
+def test_a_comparison_that_cannot_be_computed_ends_no_evaluation(
+    spheres_model, spheres_billboards, held_out, monkeypatch: pytest.MonkeyPatch
+):
     """The metrics of the photos equal those without the comparison, and a warning says why it is missing."""
-    scene = load_scene(SPHERES)
-    photos = [over_white(photo.pixels) for photo in load_photos(scene.train_frames, factor=1, threads=1)]
-    held_out = [
-        HeldOutPhoto(p.frame, p.pixels, p.used) for p in load_photos(scene.test_frames[:1], factor=1, threads=1)
-    ]
-    model = load_model(spheres_run / "field.safetensors", "cpu")
-    billboards = Billboards(scene.train_frames, photos)
 
     def singular(frame: Frame, pixels: np.ndarray) -> np.ndarray:
         raise np.linalg.LinAlgError("singular matrix")
 
-    monkeypatch.setattr(billboards, "colours", singular)
-    plain = evaluate_model(model, held_out, on_image=lambda done, total: None)
-    metrics = evaluate_model(model, held_out, on_image=lambda done, total: None, extras=Extras(billboards=billboards))
+    monkeypatch.setattr(spheres_billboards, "colours", singular)
+    plain = evaluate_model(spheres_model, held_out[:1])
+    metrics = evaluate_model(spheres_model, held_out[:1], billboards=spheres_billboards)
     assert metrics.shape is None
     assert metrics.warnings == ("the comparison with a model without geometry failed: LinAlgError: singular matrix",)
     assert metrics.mean == plain.mean

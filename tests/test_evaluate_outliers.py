@@ -69,7 +69,7 @@ def test_evaluation_warns_of_a_photo_that_shows_something_else():
         )
         for index, level in enumerate(levels)
     ]
-    metrics = evaluate_model(model, held_out, on_image=lambda done, total: None)
+    metrics = evaluate_model(model, held_out)
     assert len(metrics.warnings) == 1
     assert "5.png" in metrics.warnings[0]
-    assert evaluate_model(model, held_out[:5], on_image=lambda done, total: None).warnings == ()
+    assert evaluate_model(model, held_out[:5]).warnings == ()

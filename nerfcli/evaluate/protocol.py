@@ -97,19 +97,6 @@ PROTOCOL = "nerfcli-2"
 
 
 @dataclass(frozen=True)
-class Extras:
-    """Optional measurements: the novelty of held-out views among the training views, LPIPS, a model without geometry.
-
-    `keep` is called with each compared pair.
-    """
-
-    training: Sequence[Frame] = ()
-    perceptual: Perceptual | None = None
-    billboards: Billboards | None = None
-    keep: Callable[[ComparedImages], None] = lambda compared: None
-
-
-@dataclass(frozen=True)
 class PhotoMetrics:
     """Metrics of a held-out photo.
 
@@ -227,10 +214,16 @@ def evaluate_model(
     model: Renderable,
     held_out: Sequence[HeldOutPhoto],
     *,
-    on_image: Callable[[int, int], None],
-    extras: Extras = Extras(),
+    on_image: Callable[[int, int], None] = lambda done, total: None,
+    training: Sequence[Frame] = (),
+    perceptual: Perceptual | None = None,
+    billboards: Billboards | None = None,
+    keep: Callable[[ComparedImages], None] = lambda compared: None,
 ) -> RunMetrics:
-    """Compare the model with every held-out photo; `on_image` receives (rays done, total rays).
+    """Compare the model with every held-out photo; `on_image` receives (rays done, total rays), `keep` each pair.
+
+    Measured only if given: the novelty among `training` views, `perceptual` differences, and the evidence of geometry
+    against `billboards`.
 
     Raises:
         UserError: nothing was held out, or a mask hides a whole photo.
@@ -248,8 +241,8 @@ def evaluate_model(
         done += rays
         on_image(done, total)
 
-    views = novelty([photo.frame for photo in held_out], extras.training) if extras.training else None
-    evidence = GeometryComparison(extras.billboards) if extras.billboards is not None else None
+    views = novelty([photo.frame for photo in held_out], training) if training else None
+    evidence = GeometryComparison(billboards) if billboards is not None else None
     images = []
     for index, photo in enumerate(held_out):
         background = background_of(model, photo)
@@ -257,14 +250,14 @@ def evaluate_model(
         picture = model.render(photo.frame, background=background, on_tile=on_tile)
         seconds = time.perf_counter() - began
         pair = paired(photo, picture)
-        extras.keep(pair)
+        keep(pair)
         if evidence is not None:
             evidence.add(pair.frame, pair.rendered, pair.photo, pair.used)
         images.append(
             PhotoMetrics(
                 photo.frame.name,
                 compare_fully(
-                    pair.rendered, pair.photo, used=pair.used, perceptual=extras.perceptual, align=not pair.on_white
+                    pair.rendered, pair.photo, used=pair.used, perceptual=perceptual, align=not pair.on_white
                 ),
                 pixels=int(pair.used.sum()),
                 masked_pixels=0 if photo.used is None else int((~photo.used).sum()),
@@ -277,7 +270,7 @@ def evaluate_model(
         )
     shape = evidence.shape() if evidence is not None else None
     return RunMetrics(
-        _protocol_name(held_out, extras),
+        _protocol_name(held_out, LPIPS_NAME + " (torchmetrics)" if perceptual is not None else "no LPIPS"),
         Metrics.mean([image.metrics for image in images]),
         tuple(images),
         shape,
@@ -336,13 +329,13 @@ def outlier_warnings(images: Sequence[PhotoMetrics]) -> list[str]:
     ]
 
 
-def _protocol_name(held_out: Sequence[HeldOutPhoto], extras: Extras) -> str:
+def _protocol_name(held_out: Sequence[HeldOutPhoto], lpips: str) -> str:
     sizes = sorted({f"{photo.pixels.shape[1]}x{photo.pixels.shape[0]}" for photo in held_out})
     names = hashlib.sha256("\n".join(photo.frame.name for photo in held_out).encode()).hexdigest()[:12]
     sources = {photo.gains_from for photo in held_out} - {"none"}
     exposures = f", exposures by {' or '.join(sorted(sources))}" if sources else ""
     alpha = ", RGBA on white" if any(photo.pixels.shape[-1] == 4 for photo in held_out) else ""
-    lpips = f"{LPIPS_NAME} (torchmetrics)" if extras.perceptual is not None else "no LPIPS"
+
     return (
         f"{PROTOCOL}: {len(held_out)} held-out photos (names sha256 {names}) at {' '.join(sizes)}, area-averaged, "
         f"sRGB 8 bit{alpha}{exposures}, mean of per-image values; PSNR; SSIM with Gaussian window 1.5, 11 x 11, of "

@@ -20,7 +20,7 @@ from nerfcli.evaluate.photos import (
     save_compared,
     training_billboards,
 )
-from nerfcli.evaluate.protocol import PROTOCOL, Extras, RunMetrics, evaluate_model
+from nerfcli.evaluate.protocol import PROTOCOL, RunMetrics, evaluate_model
 from nerfcli.evaluate.requirements import WHY_ABSENT, Requirement, known_numbers, unmet
 from nerfcli.machine import Resources
 from nerfcli.notices import Reporter, silent
@@ -96,7 +96,10 @@ def evaluate_run(
             model,
             held_out,
             on_image=lambda done, total: reporter.progress(done / total, f"of {total} rays"),
-            extras=Extras(trained.cameras.train, perceptual, billboards, keep),
+            training=trained.cameras.train,
+            perceptual=perceptual,
+            billboards=billboards,
+            keep=keep,
         )
     metrics = replace(
         metrics,
@@ -142,8 +145,9 @@ def evaluate_splats(
         scene,
         held_out,
         on_image=lambda done, total: reporter.progress(done / total, f"of {total} pixels"),
+        training=trained.cameras.train,
         # The evaluation of the field has already said why there is no LPIPS.
-        extras=Extras(trained.cameras.train, find_perceptual(silent)),
+        perceptual=find_perceptual(silent),
     )
     metrics = replace(
         metrics,
