@@ -81,7 +81,7 @@ def map_photos(
     options.snapshot_path = snapshots
     options.snapshot_frames_freq = max(1, len(job.files) // _SNAPSHOTS)
     models = _run_mapper(job, report, options, begin if placed else None, placed=placed, stalled=stalled)
-    models = _write_and_read(output, models, key)
+    models = write_models(output, models, key)
     shutil.rmtree(snapshots.parent)
     return models
 
@@ -122,7 +122,7 @@ def map_globally(job: Job) -> list[pycolmap.Reconstruction]:
     options.mapper.bundle_adjustment.ceres.use_gpu = False
     with TemporaryDirectory(dir=job.folder, prefix="mapper-") as output:
         models = pycolmap.global_mapping(job.database, job.photos, output, options)
-    return _write_and_read(kept, _largest_first(models), key)
+    return write_models(kept, _largest_first(models), key)
 
 
 def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.IncrementalPipelineOptions:
@@ -243,10 +243,11 @@ class MappedModels:
     cut_short: tuple[str, ...] = ()
 
 
-def write_mapped(mapped: MappedModels, key: str) -> None:
-    """Write models and stage into the work folder, replacing earlier ones."""
+def write_mapped(mapped: MappedModels, key: str) -> MappedModels:
+    """Write models and stage into the work folder, replacing earlier ones, and read the models back."""
     also = {field: getattr(mapped, field) for field in ("attempts", "located", "seconds", "cut_short")}
-    write_models(Path(mapped.job.folder) / _MAPPED, mapped.models, key, also={"job": asdict(mapped.job), **also})
+    also["job"] = asdict(mapped.job)
+    return replace(mapped, models=write_models(Path(mapped.job.folder) / _MAPPED, mapped.models, key, also=also))
 
 
 def read_mapped(job: Job, key: str) -> MappedModels | None:
@@ -270,8 +271,8 @@ def read_mapped(job: Job, key: str) -> MappedModels | None:
 
 def write_models(
     folder: Path, models: Sequence[pycolmap.Reconstruction], key: str, *, also: Mapping[str, Any] | None = None
-) -> None:
-    """Write models below a folder, replacing earlier ones, and then FOLDER.json, the stage with their hashes."""
+) -> list[pycolmap.Reconstruction]:
+    """Write models below a folder, replacing earlier ones, then FOLDER.json, the stage with their hashes; read them."""
     stage = folder.with_suffix(".json")
     stage.unlink(missing_ok=True)
     shutil.rmtree(folder, ignore_errors=True)
@@ -280,10 +281,6 @@ def write_models(
         target.mkdir(parents=True)
         model.write_binary(target)
     write_stage(stage, key, {**(also or {}), "models": len(models), "files": file_keys(folder)})
-
-
-def _write_and_read(folder: Path, models: Sequence[pycolmap.Reconstruction], key: str) -> list[pycolmap.Reconstruction]:
-    write_models(folder, models, key)
     found = read_models(folder, key)
     if found is None:
         raise OSError(f"cannot read back the models in {folder}")

@@ -252,11 +252,7 @@ def _map(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> 
         start = time.perf_counter()
         mapped = map_with_fallbacks(matched, report, tell)
         cut_short = mapped.cut_short if unmatched is None else (unmatched, *mapped.cut_short)
-        write_mapped(replace(mapped, seconds=time.perf_counter() - start, cut_short=cut_short), key)
-    mapped = read_mapped(job, key)
-    if mapped is None:
-        raise OSError(f"cannot read back the models in {job.folder}")
-    return mapped
+        return write_mapped(replace(mapped, seconds=time.perf_counter() - start, cut_short=cut_short), key)
 
 
 def _mask_object(
