@@ -122,7 +122,7 @@ def _print_numbers(run: Path, metrics: "RunMetrics", console: Console) -> None:
         f"{run}: PSNR {mean.psnr:.2f} dB, SSIM {_number(mean.ssim, 3)} on {len(metrics.images)} held-out photos; "
         f"trained {metrics.training.seconds:.0f} s, {metrics.seconds_per_image:.2f} s per picture"
     )
-    numbers = mean.to_json()
+    numbers = vars(mean)
     rows = [
         (name, *(_number(numbers.get(f"{measure}{key}"), digits) for measure, digits in _MEASURES))
         for name, key in _COLUMNS.items()
@@ -147,7 +147,7 @@ def _print_beside_field(field: "RunMetrics", splats: "Evaluation", console: Cons
     rows = [
         (
             name,
-            *(_number(metrics.mean.to_json()[measure], digits) for measure, digits in _MEASURES),
+            *(_number(getattr(metrics.mean, measure), digits) for measure, digits in _MEASURES),
             f"{1000 * metrics.seconds_per_image:.0f}",
         )
         for name, metrics in (("field", field), ("splats", splats.metrics))

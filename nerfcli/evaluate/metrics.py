@@ -8,9 +8,9 @@ import functools
 import importlib
 import socket
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -52,15 +52,6 @@ class Metrics:
             name: None if None in found else statistics.fmean(found) for name, found in values.items()
         }
         return Metrics(**means)
-
-    @staticmethod
-    def from_json(content: Mapping[str, Any]) -> "Metrics":
-        """Return the metrics among plain values."""
-        return Metrics(**{name: content[name] for name in NAMES if name in content})
-
-    def to_json(self) -> dict[str, float | None]:
-        """Return plain values."""
-        return asdict(self)
 
 
 NAMES = tuple(field.name for field in fields(Metrics))

@@ -124,7 +124,7 @@ class PhotoMetrics:
         given = known(PhotoMetrics, content)
         if given.get("view") is not None:
             given["view"] = Novelty(**known(Novelty, given["view"]))
-        return PhotoMetrics(metrics=Metrics.from_json(content), **given)
+        return PhotoMetrics(metrics=Metrics(**known(Metrics, content)), **given)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values."""
@@ -183,7 +183,7 @@ class RunMetrics:
             for name, record in records.items():
                 if given.get(name) is not None:
                     given[name] = record(**known(record, given[name]))
-            given["mean"] = Metrics.from_json(given["mean"])
+            given["mean"] = Metrics(**known(Metrics, given["mean"]))
             given["images"] = tuple(map(PhotoMetrics.from_json, given["images"]))
             given["ledger"] = tuple(Entry(**entry) for entry in given.get("ledger") or ())
             given["warnings"] = tuple(given.get("warnings") or ())
@@ -194,7 +194,7 @@ class RunMetrics:
     def to_json(self) -> dict[str, Any]:
         """Return plain values; splats have no training of their own."""
         seconds = [image.seconds for image in self.images]
-        kinds = {kind: {"images": count, **mean.to_json()} for kind, (count, mean) in self.kinds.items()}
+        kinds = {kind: {"images": count, **asdict(mean)} for kind, (count, mean) in self.kinds.items()}
         times = {
             "seconds_per_image": self.seconds_per_image,
             "fastest_seconds": min(seconds),

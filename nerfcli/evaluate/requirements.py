@@ -3,7 +3,7 @@
 import operator
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from nerfcli.evaluate.metrics import NAMES as MEASURED
 from nerfcli.evaluate.protocol import RunMetrics
@@ -56,7 +56,7 @@ def known_numbers(metrics: RunMetrics, config: RunConfig) -> dict[str, float | N
     """Return the numbers of a run that requirements can refer to."""
     placed, photos = config.history.get("registered"), config.history.get("total")
     return {
-        **metrics.mean.to_json(),
+        **asdict(metrics.mean),
         "registered": placed / photos if placed is not None and photos else None,
         "training_seconds": None if metrics.training is None else metrics.training.seconds,
         "seconds_per_image": metrics.seconds_per_image,
