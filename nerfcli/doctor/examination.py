@@ -290,21 +290,21 @@ def _focals_px(subject: ExaminedCapture, photos: Sequence[PhotoFacts], calibrati
 
 def content(diagnosis: Diagnosis) -> dict[str, object]:
     """Return the diagnosis as plain values, for JSON."""
-    photos = []
-    for index, photo in enumerate(diagnosis.photos):
-        photos.append(
-            {
-                "name": photo.name,
-                "width": photo.exif.width,
-                "height": photo.exif.height,
-                "features": len(photo.features.pixels),
-                "lacking_detail": _rounded(float(diagnosis.missing_detail[index]), 3),
-                "stops": _rounded(float(diagnosis.exposure_stops[index]), 3),
-                "mean": _rounded(photo.exposure.mean, 4),
-                "white": round(photo.exposure.white, 4),
-                "black": round(photo.exposure.black, 4),
-            }
-        )
+    measured = zip(diagnosis.photos, diagnosis.missing_detail.tolist(), diagnosis.exposure_stops.tolist(), strict=True)
+    photos = [
+        {
+            "name": photo.name,
+            "width": photo.exif.width,
+            "height": photo.exif.height,
+            "features": len(photo.features.pixels),
+            "lacking_detail": _rounded(lacking, 3),
+            "stops": _rounded(stops, 3),
+            "mean": _rounded(photo.exposure.mean, 4),
+            "white": round(photo.exposure.white, 4),
+            "black": round(photo.exposure.black, 4),
+        }
+        for photo, lacking, stops in measured
+    ]
     return {
         "kind": diagnosis.subject.kind,
         "verdict": diagnosis.verdict,

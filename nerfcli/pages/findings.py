@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 GOOD, LOOK, BAD = "good", "look", "bad"
 VERDICTS = (GOOD, LOOK, BAD)
@@ -68,13 +68,6 @@ def worst(verdicts: Iterable[str]) -> str:
 
 def as_json(finding: Finding) -> dict[str, object]:
     """Return the finding as plain values; a number that is not finite is left out."""
-    number = finding.number
-    return {
-        "check": finding.check,
-        "verdict": finding.verdict,
-        "summary": finding.summary,
-        "number": None if number is None or not math.isfinite(number) else round(number, 4),
-        "threshold": finding.threshold,
-        "advice": finding.advice,
-        "photos": [{"name": name, "what": what} for name, what in finding.photos],
-    }
+    number = None if finding.number is None or not math.isfinite(finding.number) else round(finding.number, 4)
+    photos = [{"name": name, "what": what} for name, what in finding.photos]
+    return {**asdict(finding), "number": number, "photos": photos}

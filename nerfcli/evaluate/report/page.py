@@ -14,6 +14,7 @@ from nerfcli.evaluate.report.run_facts import RunFacts, captures_of, mismatches_
 from nerfcli.evaluate.report.tables import (
     CAPTURE,
     NUMBERS,
+    as_number,
     columns_table,
     last_logged,
     ledger_table,
@@ -135,10 +136,6 @@ def _warnings(runs: Sequence[RunFacts]) -> list[tuple[str, str]]:
     return rows
 
 
-def _structure(view: HeldOutRenderings) -> str:
-    return "not known" if view.metrics.ssim is None else f"{view.metrics.ssim:.3f}"
-
-
 def _depth_ranges(runs: Sequence[RunFacts], looks: Sequence[Sequence[HeldOutRenderings]]) -> list[ColourRange]:
     """Return the depth range of each run's colour scale, which all runs of a scene share."""
     scenes = scenes_of(runs)
@@ -163,8 +160,8 @@ def _views(
         first = seen[0][1]
         height, width = first.photo.shape[:2]
         facts = "; ".join(
-            f"{run.label + ': ' if len(runs) > 1 else ''}{view.metrics.psnr:.2f} dB, SSIM {_structure(view)}, "
-            f"depth in {100 * view.with_depth:.0f} % of the pixels"
+            f"{run.label + ': ' if len(runs) > 1 else ''}{view.metrics.psnr:.2f} dB, SSIM "
+            f"{as_number(view.metrics.ssim, 3) or 'not known'}, depth in {100 * view.with_depth:.0f} % of the pixels"
             for run, view, _ in seen
         )
         shown.append({"name": name, "facts": facts, "width": width, "height": height})

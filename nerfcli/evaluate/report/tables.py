@@ -47,7 +47,7 @@ def _of_kind(kind: str) -> Callable[[RunFacts], str]:
     return read
 
 
-def _number(value: float | None, digits: int) -> str:
+def as_number(value: float | None, digits: int) -> str:
     """Format a number with `digits` decimals; "" for None."""
     return "" if value is None else f"{value:.{digits}f}"
 
@@ -101,7 +101,7 @@ def _photos(runs: Sequence[RunFacts], *, of_many: bool) -> Table:
         row = [name]
         for images in by_run:
             found = images[name].metrics if name in images else None
-            row += ["", ""] if found is None else [_number(found.psnr, 2), _number(found.ssim, 4)]
+            row += ["", ""] if found is None else [as_number(found.psnr, 2), as_number(found.ssim, 4)]
         view = next((images[name].view for images in by_run if name in images and images[name].view), None)
         rows.append([*row, *_novelty(view)])
     columns += ["nearest training view", "distance / scene radius", "degrees between", "type of view"]
@@ -112,7 +112,7 @@ def _novelty(view: Novelty | None) -> list[str]:
     """Format how far a held-out view is from the nearest training view."""
     if view is None:
         return ["", "", "", ""]
-    return [view.nearest, _number(view.distance_relative, 3), _number(view.angle_deg, 1), view.kind]
+    return [view.nearest, as_number(view.distance_relative, 3), as_number(view.angle_deg, 1), view.kind]
 
 
 def ledger_table(runs: Sequence[RunFacts]) -> Table:
