@@ -18,6 +18,7 @@ from present import present
 from nerfcli.errors import UserError
 from nerfcli.output import Output
 from nerfcli.pages import page
+from nerfcli.photos.images import reduced
 
 EVIL = "</script><script>alert(1)</script><b>\u2028&\"'"
 
@@ -74,7 +75,7 @@ def test_pictures_read_back_by_another_reader():
     data = base64.b64decode(uri.removeprefix("data:image/png;base64,"))
     again = present(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
     np.testing.assert_array_equal(again[..., ::-1], picture)
-    small = present(cv2.imdecode(np.frombuffer(page.jpeg_bytes(picture, longest_px=32), np.uint8), cv2.IMREAD_COLOR))
+    small = present(cv2.imdecode(np.frombuffer(page.jpeg_bytes(reduced(picture, 32)), np.uint8), cv2.IMREAD_COLOR))
     assert small.shape == (24, 32, 3)
     wanted = picture.reshape(24, 2, 32, 2, 3).mean((1, 3))
     assert np.abs(small[..., ::-1] - wanted).max() < 8

@@ -23,6 +23,7 @@ from nerfcli.doctor.examination import Diagnosis, examine, find_subject
 from nerfcli.errors import UserError
 from nerfcli.matching.stationary import Motions, motions, still_px, together
 from nerfcli.pages.findings import LOOK
+from nerfcli.photos.images import reduced
 from nerfcli.poses.engine import turntable as module
 from nerfcli.poses.engine.turntable import add_advice, describe_motions, mask_turning_object, recall_masks, scene_masks
 from nerfcli.poses.input import still_background as still
@@ -220,10 +221,10 @@ class TestMasks:
         self.check(capture, pictures, cut=0.05, extra=0.05, placed=placed)
 
     def test_masks_hold_the_object_and_little_else_whatever_the_light_of_each_photo(self, capture: Turntable) -> None:
-        self.check(capture, [still.small(photo) for photo in capture.photos], cut=0.03, extra=0.03)
+        self.check(capture, [reduced(photo, still.SIDE_PX) for photo in capture.photos], cut=0.03, extra=0.03)
         gains = np.random.default_rng(0).uniform(0.8, 1.1, size=(len(capture.photos), 1, 1, 1))
         brighter = np.clip(capture.photos * gains, 0, 255).astype(np.uint8)
-        self.check(capture, [still.small(photo) for photo in brighter], cut=0.05, extra=0.06)
+        self.check(capture, [reduced(photo, still.SIDE_PX) for photo in brighter], cut=0.05, extra=0.06)
 
 
 SETTINGS = PoseSettings(max_image_size=480, max_features=500, threads=1)

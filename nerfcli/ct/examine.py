@@ -17,6 +17,7 @@ from nerfcli.output import Output
 from nerfcli.pages import page as pages
 from nerfcli.pages.findings import VERDICTS, Finding, as_json, worst
 from nerfcli.pages.page import data_uri, jpeg_bytes
+from nerfcli.photos.images import reduced
 
 _LONGEST_PX = 640
 Check = Callable[[Sample], Finding | str]
@@ -115,5 +116,5 @@ def _picture(title: str, text: str, values: np.ndarray) -> tuple[str, str, str]:
     low, high = np.quantile(values, [0.005, 0.995])
     grey = np.clip((values - low) / max(float(high - low), 1e-12), 0, 1)
     levels = np.repeat((255 * grey).astype(np.uint8)[..., None], 3, axis=2)
-    uri = data_uri(jpeg_bytes(levels, longest_px=_LONGEST_PX), "jpeg")
+    uri = data_uri(jpeg_bytes(reduced(levels, _LONGEST_PX)), "jpeg")
     return title, f"{text}, {low:.3g} (black) to {high:.3g}", uri

@@ -15,7 +15,7 @@ from nerfcli.pages.page import jpeg_bytes
 from nerfcli.photos.colours import linear_light, over_white
 from nerfcli.photos.exif import Exif, read_exif
 from nerfcli.photos.focal_evidence import with_digital_zoom
-from nerfcli.photos.images import downscale, read_image
+from nerfcli.photos.images import downscale, read_image, reduced
 from nerfcli.photos.masks import read_mask
 from nerfcli.photos.panoramas import MOST_OF_A_CAMERA, is_panorama
 
@@ -175,7 +175,7 @@ def read_photo(source: Source, most_features: int) -> PhotoFacts:
         name=source.name,
         exif=exif,
         digest=digest,
-        thumbnail=jpeg_bytes(small, longest_px=160),
+        thumbnail=jpeg_bytes(reduced(small, 160)),
         tiny=_tiny(small_grey),
         sharpness=sharp,
         exposure=measure_brightness(rgb, used),

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from nerfcli.photos.images import reduced
+
 # A match is kept if it is nearer than this times the second-nearest feature. Source: Lowe 2004, section 7.1.
 RATIO = 0.75
 # For use where the geometry of the pair is estimated next, which removes wrong matches.
@@ -47,9 +49,8 @@ def find_features(grey: np.ndarray, *, longer_side_px: int, most: int, used: np.
         used: (H, W) bool, where to look for features; None for everywhere.
     """
     height, width = grey.shape
-    scale = min(1.0, longer_side_px / max(height, width))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if scale < 1 else grey
+    small = reduced(grey, longer_side_px)
+    size = (small.shape[1], small.shape[0])
     mask = None if used is None else cv2.resize(used.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     # Without precise upscaling, OpenCV's keypoints are off by a quarter of a pixel.
     sift = cv2.SIFT.create(nfeatures=most, enable_precise_upscale=True)

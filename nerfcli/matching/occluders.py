@@ -16,6 +16,7 @@ from nerfcli.cameras.rigid import apply, inverse
 from nerfcli.matching.sky import LONGER_SIDE_PX, MOST_DIFFERENCE, OTHERS, WINDOW_PX
 from nerfcli.matching.stereo import DenseDepth
 from nerfcli.matching.tracks import MOST_POINTS
+from nerfcli.photos.images import reduced
 from nerfcli.photos.loading import LoadedPhoto
 
 # Two depths at the same place are of one surface if they differ by less than this fraction. Depths with larger expected
@@ -83,13 +84,10 @@ class _Small:
     """
 
     def __init__(self, photo: LoadedPhoto, depth: DenseDepth, sky: np.ndarray, gain: np.ndarray):
-        camera = photo.frame.camera
-        scale = min(1.0, LONGER_SIDE_PX / max(camera.width, camera.height))
-        self.camera = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
         self.world_from_cam, self.gain = photo.frame.world_from_cam, gain
-        size = self.camera.size
-        colours = np.ascontiguousarray(photo.pixels[..., :3])
-        self.levels = cv2.resize(colours, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        self.levels = reduced(np.ascontiguousarray(photo.pixels[..., :3]), LONGER_SIDE_PX).astype(np.float32)
+        camera, size = photo.frame.camera, (self.levels.shape[1], self.levels.shape[0])
+        self.camera = camera.resized(*size)
         ignored = sky if photo.used is None else sky | ~photo.used
         if photo.pixels.shape[-1] == 4:
             ignored = ignored | (photo.pixels[..., 3] < 255)

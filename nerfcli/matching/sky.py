@@ -15,6 +15,7 @@ import numpy as np
 from nerfcli.matching.exposures import FEWEST_PIXELS
 from nerfcli.matching.stereo import DenseDepth
 from nerfcli.matching.tracks import MOST_POINTS, Tracks, triangulate
+from nerfcli.photos.images import reduced
 from nerfcli.photos.loading import LoadedPhoto
 
 # Size at which photos are compared, and number of other photos that each is compared with.
@@ -123,13 +124,9 @@ class _Small:
     """A reduced photo: its levels, their means around each pixel, and the masks of usable pixels and of plain ones."""
 
     def __init__(self, photo: LoadedPhoto):
-        camera = photo.frame.camera
-        scale = min(1.0, LONGER_SIDE_PX / max(camera.width, camera.height))
-        self.camera = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-        size = self.camera.size
-        colours = np.ascontiguousarray(photo.pixels[..., :3])
-        levels = cv2.resize(colours, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-        window = (WINDOW_PX, WINDOW_PX)
+        levels = reduced(np.ascontiguousarray(photo.pixels[..., :3]), LONGER_SIDE_PX).astype(np.float32)
+        size, window = (levels.shape[1], levels.shape[0]), (WINDOW_PX, WINDOW_PX)
+        self.camera = photo.frame.camera.resized(*size)
         self.sharp, self.levels = levels, cv2.blur(levels, window)
         spread = cv2.blur(levels * levels, window) - self.levels * self.levels
         self.used = np.ones(levels.shape[:2], dtype=bool)

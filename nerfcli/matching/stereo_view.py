@@ -13,6 +13,7 @@ import numpy as np
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.matching.tracks import Tracks
+from nerfcli.photos.images import reduced
 from nerfcli.photos.loading import WIDEST_DEG, LoadedPhoto, pinhole_of, undistorted
 
 # The fewest points that determine the range of disparities of a pair.
@@ -36,15 +37,12 @@ class View:
 
 def view_of(photo: LoadedPhoto, longer_side_px: int) -> View:
     """Reduce a photo and remove its distortion."""
-    camera = photo.frame.camera
-    scale = min(1.0, longer_side_px / max(camera.width, camera.height))
-    small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-    size = (small.width, small.height)
     grey = cv2.cvtColor(np.ascontiguousarray(photo.pixels[..., :3]), cv2.COLOR_RGB2GRAY)
     used = np.full(grey.shape, 255, np.uint8) if photo.used is None else photo.used.astype(np.uint8) * 255
     if photo.pixels.shape[-1] == 4:
         used = np.minimum(used, photo.pixels[..., 3])
-    both = np.stack([cv2.resize(part, size, interpolation=cv2.INTER_AREA) for part in (grey, used)], axis=-1)
+    both = np.stack([reduced(part, longer_side_px) for part in (grey, used)], axis=-1)
+    small = photo.frame.camera.resized(both.shape[1], both.shape[0])
     pinhole = pinhole_of(small)
     both, seen = undistorted(both, small, pinhole)
     fx, fy, cx, cy = pinhole.params

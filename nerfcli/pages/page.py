@@ -194,23 +194,14 @@ def data_uri(data: bytes, kind: str) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
-def jpeg_bytes(picture: np.ndarray, *, longest_px: int | None = None, quality: int = JPEG_QUALITY) -> bytes:
-    """Encode a picture (H, W, 3) uint8 sRGB as JPEG, reduced if its longer side exceeds `longest_px`."""
-    return _encoded(fitted(picture, longest_px), ".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
+def jpeg_bytes(picture: np.ndarray, *, quality: int = JPEG_QUALITY) -> bytes:
+    """Encode a picture (H, W, 3) uint8 sRGB as JPEG."""
+    return _encoded(picture, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
 def png_bytes(picture: np.ndarray) -> bytes:
     """Encode a drawing (H, W, 3) uint8 sRGB as PNG, without loss."""
     return _encoded(picture, ".png", [])
-
-
-def fitted(picture: np.ndarray, longest_px: int | None) -> np.ndarray:
-    """Reduce a picture if its longer side exceeds the limit."""
-    scale = 1.0 if longest_px is None else longest_px / max(picture.shape[:2])
-    if scale >= 1.0:
-        return picture
-    size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
 
 def picture_rule(name: str, uri: str) -> str:

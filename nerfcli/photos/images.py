@@ -94,11 +94,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Return the (width, height) of the upright picture, from the header alone.
-
-    Raises:
-        UserError: see `read_image`; damage after the header is not detected.
-    """
+    """Return the (width, height) of the upright picture, from the header alone; a UserError as for `read_image`."""
     with opened(path) as image:
         return upright_size(image)
 
@@ -161,6 +157,14 @@ def downscale(image: np.ndarray, factor: float) -> np.ndarray:
     alpha = small[..., 3:]
     small[..., :3] *= np.divide(255, alpha, out=np.zeros_like(alpha), where=alpha > 0)
     return np.rint(small).clip(0, 255).astype(np.uint8)
+
+
+def reduced(picture: np.ndarray, longest_px: int) -> np.ndarray:
+    """Return a picture without alpha, (height, width, ...), whose longer side is at most this, averaged over areas."""
+    height, width = picture.shape[:2]
+    scale = min(1.0, longest_px / max(height, width))
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)  # a copy if the size stays the same
 
 
 def write_png(path: Path, image: np.ndarray, *, metadata: dict[str, str] | None = None) -> None:
@@ -279,8 +283,7 @@ def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
         # Of 8 bits, Pillow itself inverts levels whose white is 0.
         image = Image.fromarray(255 - high if is_inverted else high)
     if image.mode in ("I", "F"):
-        kind = "integer" if image.mode == "I" else "float"
-        what = f"{path} has 32-bit {kind} pixels, whose white level is unknown"
+        what = f"{path} has 32-bit {'integer' if image.mode == 'I' else 'float'} pixels, whose white level is unknown"
         raise UserError(what, "save it with 8 or 16 bits per channel")
     if mode == "RGBA" or image.mode not in ("RGB", "L", "CMYK"):
         image = image.convert(mode)

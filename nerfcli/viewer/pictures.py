@@ -14,6 +14,7 @@ from nerfcli.cameras.layout import centres_of, gaps_between
 from nerfcli.pages.page import data_uri, jpeg_bytes
 from nerfcli.photos.colours import over_white
 from nerfcli.photos.held_out_exposure import PhotoExposures, log_gains_of
+from nerfcli.photos.images import reduced
 from nerfcli.photos.loading import load_photo, pinhole_of, undistorted
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
@@ -133,7 +134,7 @@ def _longest(frames: Sequence[tuple[Frame, str]], shown: Sequence[int], room_byt
     # Read once at the largest size, then scaled down.
     largest = [_small_photo(frames[index][0], LONGEST_PX[0]) for index in sample]
     for longest in LONGEST_PX:
-        mean = np.mean([4 * len(jpeg_bytes(photo, longest_px=longest, quality=QUALITY)) / 3 for photo in largest])
+        mean = np.mean([4 * len(jpeg_bytes(reduced(photo, longest), quality=QUALITY)) / 3 for photo in largest])
         if 1.1 * mean * len(shown) <= room_bytes:
             return longest
     return 0

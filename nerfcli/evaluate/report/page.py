@@ -33,8 +33,9 @@ from nerfcli.evaluate.report.views import (
     depth_range,
 )
 from nerfcli.pages import figures, page
-from nerfcli.pages.page import data_uri, fitted, jpeg_bytes
+from nerfcli.pages.page import data_uri, jpeg_bytes
 from nerfcli.photos.colours import levels_of
+from nerfcli.photos.images import reduced
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.files.depth_meta import DepthMeta
 from nerfcli.render.presentation import ColourRange, coloured
@@ -123,7 +124,7 @@ def _thumbnail(look: Sequence[HeldOutRenderings]) -> tuple[str, str] | None:
     if not look:
         return None
     view = sorted(look, key=lambda view: view.metrics.psnr)[len(look) // 2]
-    both = np.hstack([fitted(view.photo, 120), fitted(view.picture, 120)])
+    both = np.hstack([reduced(view.photo, 120), reduced(view.picture, 120)])
     return view.name, data_uri(jpeg_bytes(both), "jpeg")
 
 
@@ -188,7 +189,7 @@ def _layers(
 
 
 def _layer(label: str, picture: np.ndarray) -> dict[str, str]:
-    return {"label": label, "uri": data_uri(jpeg_bytes(picture, longest_px=800), "jpeg")}
+    return {"label": label, "uri": data_uri(jpeg_bytes(reduced(picture, 800)), "jpeg")}
 
 
 def _legends(

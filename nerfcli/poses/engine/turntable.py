@@ -21,7 +21,7 @@ from PIL import Image
 from nerfcli.errors import UserError, several
 from nerfcli.matching.features import LOOSE_RATIO, Features, find_features, mutual_matches
 from nerfcli.matching.stationary import Motions, Stationary, in_place, motions, together
-from nerfcli.photos.images import image_size, read_image
+from nerfcli.photos.images import image_size, read_image, reduced
 from nerfcli.photos.masks import read_mask
 from nerfcli.poses.engine.attached import mask_attached, recalled, remembered
 from nerfcli.poses.engine.features import feature_keys
@@ -59,7 +59,7 @@ class ComparedPair:
 
 @dataclass(frozen=True)
 class _Photo:
-    """What is kept of a photo: size (width, height), the picture reduced by `still.small`, and features."""
+    """What is kept of a photo: size (width, height), the picture reduced to `still.SIDE_PX`, and features."""
 
     size: tuple[int, int]
     picture: np.ndarray
@@ -86,7 +86,7 @@ class _Photos:
         pixels = np.ascontiguousarray(read_image(self._job.photos / self._job.files[number])[..., :3])
         grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
         features = find_features(grey, longer_side_px=_SIDE_PX, most=_MOST_FEATURES)
-        return _Photo((grey.shape[1], grey.shape[0]), still.small(pixels), features)
+        return _Photo((grey.shape[1], grey.shape[0]), reduced(pixels, still.SIDE_PX), features)
 
     def matches(self, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the pixels (N, 2) in two photos at which they match; none in photos of other sizes."""
@@ -281,9 +281,9 @@ def _make_masks(photos: _Photos, training: Sequence[int], *, others: Collection[
         if len(members) < still.LEAST_PHOTOS:
             continue
         pictures = [photos[number].picture for number in members]
-        reduced = {number: placed[:2] * (1, 1, picture.shape[1] / size[0]) for number, placed in found.items()}
-        behind = still.background(pictures, [reduced[number] for number in members], np.concatenate(places))
-        for number, similarity in reduced.items():
+        similarities = {number: placed[:2] * (1, 1, picture.shape[1] / size[0]) for number, placed in found.items()}
+        behind = still.background(pictures, [similarities[number] for number in members], np.concatenate(places))
+        for number, similarity in similarities.items():
             shown = photos[number].picture
             masks[number] = still.differs(shown, behind.seen_with(similarity, (shown.shape[1], shown.shape[0])))
     return [masks[number] for number in sorted(masks)]

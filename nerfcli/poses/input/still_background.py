@@ -67,16 +67,8 @@ class Background:
         )
 
 
-def small(picture: np.ndarray) -> np.ndarray:
-    """Reduce a picture (height, width, 3) uint8 to `SIDE_PX`."""
-    height, width = picture.shape[:2]
-    scale = min(1.0, SIDE_PX / max(height, width))
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-
-
 def background(pictures: Sequence[np.ndarray], placed: Sequence[np.ndarray], places: np.ndarray) -> Background:
-    """Estimate the static background of `LEAST_PHOTOS` or more equally large pictures (h, w, 3), see `small`.
+    """Estimate the static background of `LEAST_PHOTOS` or more equally large pictures (h, w, 3), reduced to `SIDE_PX`.
 
     Args:
         placed: the similarity (2, 3) of each, from pixels of the frame of reference to its own.
