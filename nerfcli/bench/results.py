@@ -121,8 +121,7 @@ def _draw(path: Path, about: Mapping[str, Any], points: Sequence[Point]) -> None
     axes.margins(0.12)
     axes.set_xlabel("seconds per picture" if of_rendering else "seconds of training")
     axes.set_ylabel("rms error against a converged rendering, of 255 levels" if of_rendering else "held-out PSNR, dB")
-    axes.set_title(
-        f"{Path(about['source']).name} on {about['machine']['processor']}, {about['machine']['threads']} threads"
-    )
+    title = f"{Path(about['source']).name} on {about['machine']['processor']}, {about['machine']['threads']} threads"
+    axes.set_title(title)
     axes.grid(alpha=0.3)
     figures.write_png(figure, path)

@@ -122,9 +122,8 @@ def choose_pairs(photos: Sequence[PhotoFacts]) -> list[tuple[int, int]]:
     if count <= ALL_ALIKE_UP_TO:
         return list(combinations(range(count), 2))
     near = {(i, i + step) for step in _STEPS_BY_NAME for i in range(count - step)}
-    coarsest = [
-        photo.features.descriptors[np.argsort(-photo.features.scales, kind="stable")[:_COARSEST]] for photo in photos
-    ]
+    features = [photo.features for photo in photos]
+    coarsest = [each.descriptors[np.argsort(-each.scales, kind="stable")[:_COARSEST]] for each in features]
     shared = likeness(coarsest, lambda stage, done, total: None)
     return sorted(near | set(alike(shared, _LOOK_ALIKES, paired=near)))
 

@@ -270,9 +270,7 @@ def _focals_px(subject: ExaminedCapture, photos: Sequence[PhotoFacts], calibrati
     """Return focal lengths at the feature-detection size: of given cameras or the scene's, from EXIF, or typical."""
     if calibration is not None:
         paths = {source.name: source.path for source in subject.sources}
-        pictures = [
-            Picture(paths[photo.name], photo.exif.width, photo.exif.height, photo.exif.orientation) for photo in photos
-        ]
+        pictures = [Picture(paths[p.name], p.exif.width, p.exif.height, p.exif.orientation) for p in photos]
         cameras = [found.camera for found in calibrated(calibration, pictures)]
     elif subject.scene is not None:
         cameras = [frame.camera for frame in _frames(subject.scene, photos)]

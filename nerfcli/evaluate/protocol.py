@@ -229,10 +229,8 @@ def evaluate_model(
         UserError: nothing was held out, or a mask hides a whole photo.
     """
     if not held_out:
-        raise UserError(
-            "this run has no held-out photos to evaluate on",
-            "train again with --holdout every:8 --overwrite",
-        )
+        hint = "train again with --holdout every:8 --overwrite"
+        raise UserError("this run has no held-out photos to evaluate on", hint)
     total = sum(photo.pixels.shape[0] * photo.pixels.shape[1] for photo in held_out)
     done = 0
 

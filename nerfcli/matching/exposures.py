@@ -51,11 +51,9 @@ def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]
             seen &= ((both > DARKEST) & (both < BRIGHTEST)).all(1)
             if seen.sum() < FEWEST_PIXELS:
                 continue
-            ratio = _light(around[other][row[seen], column[seen]]) / _light(
-                around[one][pixels[seen, 1], pixels[seen, 0]]
-            )
+            own, theirs = around[one][pixels[seen, 1], pixels[seen, 0]], around[other][row[seen], column[seen]]
             pairs.append((one, other))
-            ratios.append(np.median(np.log(ratio), axis=0))
+            ratios.append(np.median(np.log(_light(theirs) / _light(own)), axis=0))
             counts.append(min(int(seen.sum()), 500))  # errors of neighbouring pixels are correlated
     return _gains(len(photos), np.array(pairs).reshape(-1, 2), np.array(ratios).reshape(-1, 3), np.array(counts))
 

@@ -112,9 +112,8 @@ def _bounds(view: View, turned: np.ndarray, focal: float) -> tuple[np.ndarray, n
     height, width = view.grey.shape
     corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], dtype=np.float64)
     rays = corners @ (turned @ view.turn.T @ np.linalg.inv(view.matrix)).T
-    places = (
-        focal * rays[:, :2] / np.maximum(rays[:, 2:], LEAST_RISE)
-    )  # corners that are turned away further would make the box too large
+    # Corners that are turned away further would make the box too large.
+    places = focal * rays[:, :2] / np.maximum(rays[:, 2:], LEAST_RISE)
     return places.min(0), places.max(0)
 
 

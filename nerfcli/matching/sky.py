@@ -95,9 +95,8 @@ def points_of_depths(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth])
     exact = [np.flatnonzero(depth.errors < MOST_ERROR) for depth in dense]
     step = math.ceil(sum(map(len, exact)) / MOST_POINTS) or 1
     chosen = zip(photos, dense, exact, strict=True)
-    return np.concatenate([depth.points(photo.frame, numbers[::step]) for photo, depth, numbers in chosen])[
-        :MOST_POINTS
-    ]
+    points = [depth.points(photo.frame, numbers[::step]) for photo, depth, numbers in chosen]
+    return np.concatenate(points)[:MOST_POINTS]
 
 
 def points_before(masks: Sequence[np.ndarray], photos: Sequence[LoadedPhoto], points: np.ndarray) -> PointsBefore:

@@ -220,7 +220,6 @@ def _common(x: np.ndarray, y: np.ndarray, *, one: np.ndarray, other: np.ndarray,
     If the moving matches are on a plane, many matrices fit them, and one may also fit the still ones.
     """
     count = min(one.sum(), other.sum())
-    chosen = np.concatenate(
-        [np.flatnonzero(which)[np.linspace(0, which.sum() - 1, count).astype(int)] for which in (one, other)]
-    )
+    both = np.flatnonzero(one), np.flatnonzero(other)
+    chosen = np.concatenate([which[np.linspace(0, len(which) - 1, count).astype(int)] for which in both])
     return fundamental_matrix(x[chosen], y[chosen], within_px=within, least=_LEAST_MATCHES)[0]

@@ -69,9 +69,8 @@ def tracks_of_matches(photos: Sequence[LoadedPhoto], matched: Sequence[Matches])
         first += len(points)
         for number, pixels in zip(matches.photos, matches.pixels, strict=True):
             frame = photos[number].frame
-            parts.append(
-                (np.full(len(points), number), points, world_rays(frame.camera.bearings(pixels), frame.world_from_cam))
-            )
+            rays = world_rays(frame.camera.bearings(pixels), frame.world_from_cam)
+            parts.append((np.full(len(points), number), points, rays))
     return Tracks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -120,10 +119,8 @@ def _nearest(origins: np.ndarray, tracks: Tracks, used: np.ndarray) -> np.ndarra
         return np.bincount(of, values, tracks.count)
 
     # Entry by entry: a matrix for each sighting would take as much memory as the photos of a large capture.
-    products = [[summed(rays[:, i] * rays[:, j]) for j in range(3)] for i in range(3)]
-    matrices = np.eye(3) * np.bincount(of, minlength=tracks.count)[:, None, None] - np.array(products).transpose(
-        2, 0, 1
-    )
+    products = np.array([[summed(rays[:, i] * rays[:, j]) for j in range(3)] for i in range(3)]).transpose(2, 0, 1)
+    matrices = np.eye(3) * np.bincount(of, minlength=tracks.count)[:, None, None] - products
     along = np.einsum("oi,oi->o", rays, origins)
     sums = np.stack([summed(origins[:, i] - rays[:, i] * along) for i in range(3)], axis=-1)
     determined = np.linalg.eigvalsh(matrices)[:, 0] > 1.0 - np.cos(LEAST_ANGLE_RAD)

@@ -45,10 +45,9 @@ def finding(
     photos: Iterable[tuple[str, str]] = (),
 ) -> Finding:
     """Return the finding of a check, which has advice and names photos only where its verdict is not good."""
-    is_good = verdict == GOOD
-    return Finding(
-        check, verdict, summary, number, threshold, "" if is_good else advice, () if is_good else tuple(photos)
-    )
+    if verdict == GOOD:
+        advice, photos = "", ()
+    return Finding(check, verdict, summary, number, threshold, advice, tuple(photos))
 
 
 def verdict_above(number: float, *, look: float, bad: float) -> str:

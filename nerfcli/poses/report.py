@@ -91,10 +91,8 @@ def make_report(
             images[name] = ImageReport(name, True, None, orientation, result["pose_blur_px"].get(name))
         else:
             elsewhere = max((len(model) for model in models[1:] if name in model), default=0)
-            size_px = photo.exif.width, photo.exif.height
-            why = result["left_out"].get(name) or reason(
-                **result["evidence"][name], other_model_size=elsewhere, size_px=size_px
-            )
+            known = {"other_model_size": elsewhere, "size_px": (photo.exif.width, photo.exif.height)}
+            why = result["left_out"].get(name) or reason(**result["evidence"][name], **known)
             images[name] = ImageReport(name, False, why, orientation)
     blurs = sorted((image.pose_blur_px, image.name) for image in images.values() if image.pose_blur_px is not None)
     named_alike = {field.name: result[field.name] for field in fields(PosesReport) if field.name in result}
@@ -130,9 +128,8 @@ def closing_notes(report: PosesReport) -> list[str]:
         names = component["photos"]
         some = names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
         why = f": {component['apart']}" if component["apart"] else ""
-        notes.append(
-            f"{component['size']} photos ({some}) form a model of their own{why}; estimate their poses separately"
-        )
+        those = f"{component['size']} photos ({some})"
+        notes.append(f"{those} form a model of their own{why}; estimate their poses separately")
     weak = [camera for camera in report.cameras if (camera.get("uncertainty") or {}).get("weak")]
     if weak:
         worst = max(weak, key=lambda camera: camera["uncertainty"]["focal_percent"])
@@ -141,9 +138,8 @@ def closing_notes(report: PosesReport) -> list[str]:
         accuracy = f"focal length ± {certain['focal_percent']:.1f} %"
         if certain["distortion_border_px"] is not None:
             accuracy += f", distortion ± {certain['distortion_border_px']:.1f} px at the corners"
-        notes.append(
-            f"intrinsics are weakly determined ({which} {several(images, 'photo')}: {accuracy}): give --intrinsics"
-        )
+        weakest = f"{which} {several(images, 'photo')}: {accuracy}"
+        notes.append(f"intrinsics are weakly determined ({weakest}): give --intrinsics")
     stabilised = report.principal_points
     if stabilised is not None and stabilised["kept"]:
         notes.append(

@@ -193,12 +193,7 @@ def _lay_out(prepared: PreparedPhotos, work: Path, notify: Tell) -> Job:
 
 
 def _describe_scene(
-    report: PosesReport,
-    scene_dir: Path,
-    photos_dir: Path,
-    *,
-    given: Calibration | None,
-    split: dict[str, str | None],
+    report: PosesReport, scene_dir: Path, photos_dir: Path, *, given: Calibration | None, split: dict[str, str | None]
 ) -> None:
     """Write poses_report.json and scene.json."""
     write_json(scene_dir / "poses_report.json", asdict(report))

@@ -61,9 +61,7 @@ def mark_of(runs: Sequence[Path]) -> page.Mark:
 
 def origin_of(runs: Sequence[RunFacts], hashes: Sequence[str], *, views: int, depth: DepthRequest) -> str:
     """Return a digest of all that a page is made from: fields, by their `hashes`, metrics, logs, settings, options."""
-    facts = [
-        [run.label, run.config.to_json(), run.log, run.metrics and run.metrics.to_json(), run.poses] for run in runs
-    ]
+    facts = [[r.label, r.config.to_json(), r.log, r.metrics and r.metrics.to_json(), r.poses] for r in runs]
     return digest([__version__, list(hashes), facts, views, asdict(depth)])
 
 

@@ -221,9 +221,8 @@ class MappingAttempts:
         self, what: str, job: Job, start: MapperOptions, *, base: pycolmap.Reconstruction | None = None
     ) -> list[pycolmap.Reconstruction]:
         def cut(seconds: float) -> None:
-            self._cut(
-                f"{what}: stopped after {duration(seconds)} without another photo; only its largest snapshot is kept"
-            )
+            without = f"stopped after {duration(seconds)} without another photo"
+            self._cut(f"{what}: {without}; only its largest snapshot is kept")
 
         return map_photos(job, self.report, attempt=len(self.record), start=start, base=base, stalled=cut)
 

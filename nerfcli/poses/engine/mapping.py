@@ -204,9 +204,8 @@ def _adjust_fully(model: pycolmap.Reconstruction, job: Job, options: pycolmap.In
         num_threads=job.threads, constant_cameras=set(job.solver.fixed), ba_global_function_tolerance=1e-6
     )
     with pycolmap.Database.open(job.database) as database:
-        cache = pycolmap.DatabaseCache.create(
-            database, pycolmap.DatabaseCacheOptions(min_num_matches=options.min_num_matches)
-        )
+        wanted = pycolmap.DatabaseCacheOptions(min_num_matches=options.min_num_matches)
+        cache = pycolmap.DatabaseCache.create(database, wanted)
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(model)
     mapper.iterative_global_refinement(

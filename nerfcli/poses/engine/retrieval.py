@@ -89,9 +89,8 @@ def alike(likeness: np.ndarray, count: int, *, paired: Collection[tuple[int, int
 def promising(likeness: np.ndarray, pairs: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
     """Return the pairs with enough common features, and for each photo its few most similar pairs in any case."""
     ordered = sorted(pairs, key=lambda pair: (-likeness[pair], pair))
-    strong = np.bincount(
-        [photo for pair in ordered if likeness[pair] >= _MANY for photo in pair], minlength=len(likeness)
-    )
+    in_strong = [photo for pair in ordered if likeness[pair] >= _MANY for photo in pair]
+    strong = np.bincount(in_strong, minlength=len(likeness))
     kept: list[tuple[int, int]] = []
     taken = np.zeros(len(likeness), dtype=int)
     for i, j in ordered:

@@ -55,13 +55,9 @@ def place_held_out(job: Job, mapped: Job, result: dict[str, Any], report: Report
     as one for all photos, with "strict": how each held-out photo was placed.
     """
     if not result["models"]:
-        held_out_names = [job.names[number] for number in job.held_out]
-        nothing = {"features": 0, "best_matches": 0, "best_partner": None}
-        unseen = dict.fromkeys(held_out_names, nothing)
-        return result | {
-            "left_out": dict.fromkeys(held_out_names, NO_MODEL),
-            "evidence": result["evidence"] | unseen,
-        }
+        names = [job.names[number] for number in job.held_out]
+        unseen = {name: {"features": 0, "best_matches": 0, "best_partner": None} for name in names}
+        return result | {"left_out": dict.fromkeys(names, NO_MODEL), "evidence": result["evidence"] | unseen}
     job = _with_features_and_lenses(job, mapped)
     extract(job, report)
     job = select_pairs(job, report)

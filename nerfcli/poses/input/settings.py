@@ -10,17 +10,8 @@ from nerfcli.poses.input.pairs import PAIRINGS
 
 # Choices of `camera_model`.
 CAMERA_MODELS = (
-    "auto",
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "FULL_OPENCV",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-    "OPENCV_FISHEYE",
-    "EQUIRECTANGULAR",
+    *("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "EQUIRECTANGULAR"),
 )
 
 # More than the longer side of any photo, so that features are extracted at full size.
@@ -106,9 +97,8 @@ def check_settings(settings: PoseSettings) -> None:
         UserError: there is no such folder or file.
     """
     if settings.max_image_size < 1 or (settings.max_features is not None and settings.max_features < 1):
-        raise ValueError(
-            f"image size and features must be positive, got {settings.max_image_size} and {settings.max_features}"
-        )
+        got = f"{settings.max_image_size} and {settings.max_features}"
+        raise ValueError(f"image size and features must be positive, got {got}")
     if settings.camera_model not in CAMERA_MODELS:
         raise ValueError(f"camera_model must be one of {', '.join(CAMERA_MODELS)}, got {settings.camera_model}")
     if not 0 <= settings.min_registered <= 1:

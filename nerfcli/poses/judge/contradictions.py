@@ -65,9 +65,8 @@ def leave_out_contradicting(
             reasons[photo] = "connected to the rest only through a photo that contradicts it"
         else:
             other = pair.other if pair.one == names[photo] else pair.one
-            reasons[photo] = (
-                f"contradicts the rest: its {pair.matches} matches with {other} are inconsistent with the poses"
-            )
+            its = f"its {pair.matches} matches with {other}"
+            reasons[photo] = f"contradicts the rest: {its} are inconsistent with the poses"
     if len(reasons) > _MOST_LEFT_OUT * len(placed):
         return model, {}
     return without_photos(model, reasons), reasons

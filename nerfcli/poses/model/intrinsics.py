@@ -122,10 +122,9 @@ def choose_lenses(
             camera = result.cameras[camera_id]
             camera.principal_point_x, camera.principal_point_y = camera.width / 2, camera.height / 2
         refine_model(result, solver)
+    still_free = set(freed).difference(strayed)
     certain = {
-        camera_id: uncertainty(
-            result, camera_id, solver, principal_point=camera_id in freed and camera_id not in strayed
-        )
+        camera_id: uncertainty(result, camera_id, solver, principal_point=camera_id in still_free)
         for camera_id, _ in photos.most_common(MOST_CAMERAS)
     }
     return ModelLenses(result, certain)
@@ -184,9 +183,8 @@ def refine_model(model: pycolmap.Reconstruction, solver: Solver, *, principal_po
 
 def convert_camera(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
     """Return a camera of another COLMAP model that projects rays to nearly the same pixels, same principal point."""
-    start = pycolmap.Camera.create_from_model_name(
-        camera.camera_id, name, camera.mean_focal_length(), camera.width, camera.height
-    )
+    focal_px = camera.mean_focal_length()
+    start = pycolmap.Camera.create_from_model_name(camera.camera_id, name, focal_px, camera.width, camera.height)
     start.principal_point_x, start.principal_point_y = camera.principal_point_x, camera.principal_point_y
     start.has_prior_focal_length = camera.has_prior_focal_length
     columns, rows = np.meshgrid(np.linspace(0, camera.width, 15), np.linspace(0, camera.height, 15))
@@ -202,7 +200,7 @@ def convert_camera(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
         found = projected(start, rays[good]) - pixels[good]
         return np.nan_to_num(found, nan=1e3).ravel()  # a ray that the trial cannot project counts as far off
 
-    scale = np.array([camera.mean_focal_length() if i in start.focal_length_idxs() else 0.1 for i in free])
+    scale = np.array([focal_px if i in start.focal_length_idxs() else 0.1 for i in free])
     fitted = least_squares(misses, params[free], x_scale=scale, loss="soft_l1")
     params[free] = fitted.x
     start.params = params.tolist()

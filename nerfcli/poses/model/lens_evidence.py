@@ -126,9 +126,8 @@ class Estimate:
         """Return the squared Mahalanobis distance of some parameters from zero, the least of all ways."""
         index = [self.names.index(name) for name in names]
         values = self.values[index]
-        return float(
-            min(values @ np.linalg.pinv(covariance[np.ix_(index, index)]) @ values for covariance in self.covariances)
-        )
+        own = (covariance[np.ix_(index, index)] for covariance in self.covariances)
+        return float(min(values @ np.linalg.pinv(covariance) @ values for covariance in own))
 
 
 def lens_evidence(
@@ -268,9 +267,8 @@ def _jacobians(
             start = len(NAMES) + 2 * others.index(of)
             lens[rows, :, start : start + 2] = terms[:, :, [NAMES.index("f"), NAMES.index("k1")]]
     # Points that cannot be projected contribute nothing.
-    bad = ~(
-        np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(residuals).all(axis=1) & np.isfinite(lens).all(axis=(1, 2))
-    )
+    finite = np.isfinite(poses).all(axis=(1, 2)), np.isfinite(lens).all(axis=(1, 2)), np.isfinite(residuals).all(axis=1)
+    bad = ~np.all(finite, axis=0)
     for array in (poses, points, lens, residuals):
         array[bad] = 0
     return poses, points, lens, residuals
@@ -279,11 +277,10 @@ def _jacobians(
 def projection_jacobians(camera: pycolmap.Camera, local: Array) -> Array:
     """Return pixels per unit of points (n, 3) in the camera's axes, (n, 2, 3), by central differences."""
     step = 1e-5 * np.linalg.norm(local, axis=1, keepdims=True)
-    columns = []
-    for offset in np.eye(3):
-        columns.append(
-            (projected(camera, local + step * offset) - projected(camera, local - step * offset)) / (2 * step)
-        )
+    columns = [
+        (projected(camera, local + step * offset) - projected(camera, local - step * offset)) / (2 * step)
+        for offset in np.eye(3)
+    ]
     return np.stack(columns, axis=-1)
 
 

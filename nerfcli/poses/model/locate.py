@@ -91,9 +91,8 @@ def locate_photos(
     """
     grown = pycolmap.Reconstruction(model)
     if model.num_points3D() < _LEAST_FOUND:
-        return grown, [
-            LocationAttempt(image_id, refused="the model has too few points") for image_id in sorted(image_ids)
-        ]
+        why = "the model has too few points"
+        return grown, [LocationAttempt(image_id, refused=why) for image_id in sorted(image_ids)]
     attempts: dict[int, LocationAttempt] = {}
     left = sorted(image_ids)
     files = dict(zip(job.image_ids, job.files, strict=True))
@@ -105,11 +104,9 @@ def locate_photos(
             model_points = known_points(grown, database)
             fresh = np.isin(model_points.photos, placed_before)
             photos = [photo_features(grown, database, image_id) for image_id in left]
-            try_one = partial(
-                _try_to_place, model_points=model_points, fresh=fresh if turn > 0 else None, seed=job.seed
-            )
+            trial = partial(_try_to_place, model_points=model_points, fresh=fresh if turn > 0 else None, seed=job.seed)
             placed_now = []
-            results = zip(left, photos, pool.map(try_one, left, photos), strict=True)
+            results = zip(left, photos, pool.map(trial, left, photos), strict=True)
             for number, (image_id, photo, (placed, attempt)) in enumerate(results):
                 report("locate", turn * len(image_ids) + number, total)
                 attempts[image_id] = attempt or attempts[image_id]

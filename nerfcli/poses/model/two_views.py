@@ -68,9 +68,8 @@ def count_matches(database: Path) -> list[tuple[int, int, int]]:
     """Return (image id, image id, verified matches) of all pairs in a database, in ascending order."""
     with pycolmap.Database.open(database) as opened:
         pair_ids, counts = opened.read_two_view_geometry_num_inliers()
-    return sorted(
-        (*pycolmap.pair_id_to_image_pair(pair_id), count) for pair_id, count in zip(pair_ids, counts, strict=True)
-    )
+    counted = zip(pair_ids, counts, strict=True)
+    return sorted((*pycolmap.pair_id_to_image_pair(pair_id), count) for pair_id, count in counted)
 
 
 def read_verified_pairs(database: Path, *, min_matches: int) -> list[VerifiedPair]:
