@@ -249,15 +249,11 @@ def groups(given: Sequence[Frame], pairs: Sequence[Pair]) -> Finding | None:
     return misplaced_groups(given, photos, pair_errors(given, photos, pairs), pairs)
 
 
-def half_turned(pose: np.ndarray) -> np.ndarray:
-    """Return a pose on the opposite side of the ring."""
-    return np.diag([-1.0, -1.0, 1.0, 1.0]) @ pose
-
-
 def test_a_group_of_photos_on_the_wrong_side_is_named_though_its_photos_agree_with_each_other():
     frames, group = ring(36), range(10, 15)
     pairs = compared_pairs(frames, lambda i, j: (i in group) == (j in group))
-    given = posed(frames, {index: half_turned(frames[index].world_from_cam) for index in group})
+    opposite = np.diag([-1.0, -1.0, 1.0, 1.0])
+    given = posed(frames, {index: opposite @ frames[index].world_from_cam for index in group})
     assert checked(given, pairs).photos == ()  # each pair agrees
     found = groups(given, pairs)
     assert found is not None

@@ -90,17 +90,8 @@ def test_the_clock_orders_a_walk_but_not_a_holiday(gap: float, rule: str):
 
 def grid(spacing_deg: float) -> list[Photo]:
     """Ten by ten photos on a grid on the ground, at 60 degrees north, across the antimeridian."""
-    return [
-        replace(
-            photo,
-            exif=replace(NO_EXIF, gps=(60 + spacing_deg * (k // 10), wrapped(180 + 2 * spacing_deg * (k % 10)), None)),
-        )
-        for k, photo in enumerate(lettered(100))
-    ]
-
-
-def wrapped(longitude: float) -> float:
-    return longitude - 360 if longitude > 180 else longitude
+    gps = [(60 + spacing_deg * (k // 10), 2 * spacing_deg * (k % 10 - 5) % 360 - 180, None) for k in range(100)]
+    return [replace(one, exif=replace(NO_EXIF, gps=place)) for one, place in zip(lettered(100), gps, strict=True)]
 
 
 def test_photos_that_gps_separates_are_compared_with_the_nearest():

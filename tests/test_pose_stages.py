@@ -156,7 +156,9 @@ def test_a_damaged_model_is_made_again_from_what_is_whole(
 def test_another_camera_model_extracts_and_matches_nothing_again(photos: Path, whole: Path, again: Path):
     stages: dict[str, int] = {}
     settings = replace(ONE_THREAD, camera_model="SIMPLE_PINHOLE")
-    report = estimate(photos, again, settings, progress=lambda stage, done, total: void(stages.setdefault(stage, done)))
+    report = estimate(
+        photos, again, settings, progress=lambda stage, done, total: stages.update({stage: stages.get(stage, done)})
+    )
     assert stages["extract"] == len(NAMES) + 1  # all of them were there from the first
     assert rows(again, "descriptors") == rows(whole, "descriptors")
     assert rows(again, "matches", "pair_id") == rows(whole, "matches", "pair_id")
@@ -166,16 +168,13 @@ def test_another_camera_model_extracts_and_matches_nothing_again(photos: Path, w
     assert model(again) == model(whole)
 
 
-def void(value: object) -> None:
-    """Discard a value, so that a lambda returns None."""
-
-
 @pytest.mark.usefixtures("same_process")
 def test_another_photo_and_other_pairs_do_only_what_is_new(photos: Path, whole: Path, again: Path, tmp_path: Path):
     """A photo that is first by name shifts the others' positions, but not their ids in the database."""
     more = shutil.copytree(photos, tmp_path / "more")
     shutil.copy(photos / NAMES[2], more / "a first one.png")
-    (tmp_path / "pairs.txt").write_text(f"a first one.png {NAMES[2]}\n" + "\n".join(chain()))
+    pairs = [f"a first one.png {NAMES[2]}", *(f"{one} {other}" for one, other in pairwise(NAMES))]
+    (tmp_path / "pairs.txt").write_text("\n".join(pairs))
     settings = replace(ONE_THREAD, pairs_file=str(tmp_path / "pairs.txt"))
     with pytest.raises(KilledError):
         estimate(more, again, settings, progress=killed_at("map", 0))
@@ -188,10 +187,6 @@ def test_another_photo_and_other_pairs_do_only_what_is_new(photos: Path, whole: 
     assert len(new) == len(old) + 1
     # The mapper sees the listed pairs and no others.
     assert len(rows(again, "two_view_geometries", "pair_id")) == len(NAMES)
-
-
-def chain() -> list[str]:
-    return [f"{one} {other}" for one, other in pairwise(NAMES)]
 
 
 @pytest.mark.usefixtures("same_process")
