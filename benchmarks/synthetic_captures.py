@@ -7,6 +7,7 @@ matches. Everything from the verification of the matches on is real.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -368,20 +369,20 @@ def synthetic_job(folder: Path, views: Sequence[View], *, seed: int) -> Job:
         )
         for lens in lenses
     )
-    return Job(
-        folder=str(work),
-        files=names,
-        originals=str(work / "photos"),
-        names=names,
-        keys=names,
-        groups=groups,
-        pairs=all_pairs(len(views)),
-        neighbours=0,
-        max_image_size=FULL_SIZE,
-        max_features=8192,
-        seed=seed,
-        threads=1,
-    )
+    return job_of(work, names, groups, pairs=all_pairs(len(views)), seed=seed)
+
+
+def job_of(work: Path, files: tuple[str, ...], groups: tuple[CameraGroup, ...], **others: Any) -> Job:
+    """Return the job of photos in a work folder, on one thread, without pairs but for `others`: any fields of `Job`."""
+    usual: dict[str, Any] = {
+        "originals": str(work / "photos"),
+        "names": files,
+        "keys": files,
+        "pairs": (),
+        "neighbours": 0,
+    }
+    usual |= {"max_image_size": FULL_SIZE, "max_features": 8192, "seed": 0, "threads": 1}
+    return Job(folder=str(work), files=files, groups=groups, **usual | others)
 
 
 def true_model(views: Sequence[View]) -> pycolmap.Reconstruction:

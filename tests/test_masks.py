@@ -3,11 +3,13 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from synthetic_captures import job_of
 
 from nerfcli.errors import UserError
 from nerfcli.photos.images import read_image, write_png
@@ -177,21 +179,9 @@ def job_for(photos: Photos, masks: tuple[WorkMask, ...], folder: Path) -> Job:
     for name, file in zip(photos.names, files, strict=True):
         (folder / "photos" / file).symlink_to(photos.folder / name)
     first: Photo = photos.photos[0]
-    return Job(
-        folder=str(folder),
-        files=files,
-        originals=str(photos.folder),
-        names=photos.names,
-        keys=files,
-        groups=(CameraGroup(tuple(range(len(files))), "SIMPLE_RADIAL", first.width, first.height),),
-        pairs=(),
-        neighbours=0,
-        max_image_size=1600,
-        max_features=1000,
-        seed=0,
-        threads=1,
-        masks=masks,
-    )
+    group = CameraGroup(tuple(range(len(files))), "SIMPLE_RADIAL", first.width, first.height)
+    given: dict[str, Any] = {"originals": str(photos.folder), "names": photos.names, "masks": masks}
+    return job_of(folder, files, (group,), max_image_size=1600, max_features=1000, **given)
 
 
 def test_features_lie_where_the_mask_is_white(photos, masks, tmp_path):

@@ -13,6 +13,7 @@ import pytest
 from corner import CENTRES, NAMES, cam_from_world, write_capture
 from in_this_process import poses_in_this_process
 from PIL import Image
+from synthetic_captures import job_of
 from test_poses import FAST
 
 from nerfcli.cameras.alignment import align
@@ -141,25 +142,15 @@ def test_a_held_out_photo_is_placed_with_the_features_of_the_model(solved, tmp_p
 
 def job_of_five() -> Job:
     """The second and third photos are held out."""
-    return Job(
-        folder="work",
-        files=("00000.jpg", "00003.jpg", "00004.jpg", "00007.jpg", "00008.jpg"),
-        originals="photos",
-        names=("a", "b", "c", "d", "e"),
-        keys=("ka", "kb", "kc", "kd", "ke"),
-        groups=(
-            CameraGroup((1,), "OPENCV", 4, 3),
-            CameraGroup((0, 2), "PINHOLE", 4, 3),
-            CameraGroup((3, 4), "RADIAL", 8, 6),
-        ),
-        pairs=((0, 1), (0, 2), (1, 3), (2, 4), (3, 4)),
-        neighbours=0,
-        max_image_size=100,
-        max_features=100,
-        seed=0,
-        threads=1,
-        held_out=(1, 2),
+    files = ("00000.jpg", "00003.jpg", "00004.jpg", "00007.jpg", "00008.jpg")
+    groups = (
+        CameraGroup((1,), "OPENCV", 4, 3),
+        CameraGroup((0, 2), "PINHOLE", 4, 3),
+        CameraGroup((3, 4), "RADIAL", 8, 6),
     )
+    named: dict[str, Any] = {"names": ("a", "b", "c", "d", "e"), "keys": ("ka", "kb", "kc", "kd", "ke")}
+    pairs = ((0, 1), (0, 2), (1, 3), (2, 4), (3, 4))
+    return job_of(Path("work"), files, groups, pairs=pairs, held_out=(1, 2), **named)
 
 
 def test_a_held_out_photo_is_not_said_to_lack_features_where_no_training_photo_is_placed():

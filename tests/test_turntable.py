@@ -286,20 +286,7 @@ def job(
     names = tuple(f"{number}.png" for number in range(len(capture.photos)))
     for name, photo in zip(names, capture.photos, strict=True):
         Image.fromarray(photo).save(work / "photos" / name, compress_level=1)
-    made = Job(
-        folder=str(work),
-        files=names,
-        originals=str(work / "photos"),
-        names=names,
-        keys=names,
-        groups=(CameraGroup(tuple(range(len(names))), "PINHOLE", 480, 360),),
-        pairs=(),
-        neighbours=0,
-        max_image_size=480,
-        max_features=500,
-        seed=0,
-        threads=1,
-    )
+    made = synthetic.job_of(work, names, (CameraGroup(tuple(range(len(names))), "PINHOLE", 480, 360),))
     mask_turning_object(made, lambda note: None)
     return made
 
