@@ -15,13 +15,8 @@ WIDTH, HEIGHT, FOCAL_PX = 480, 360, 450.0
 # Camera centres; then the photos stored on their side (EXIF orientation 6), and those of the smaller size.
 CENTRES = np.array(
     [
-        (3.4, 1.6, 1.5),
-        (3.1, 2.2, 1.6),
-        (2.7, 2.7, 1.4),
-        (2.2, 3.1, 1.7),
-        (1.6, 3.4, 1.5),
-        (2.9, 2.4, 2.3),
-        (2.4, 2.9, 2.4),
+        *((3.4, 1.6, 1.5), (3.1, 2.2, 1.6), (2.7, 2.7, 1.4), (2.2, 3.1, 1.7), (1.6, 3.4, 1.5)),
+        *((2.9, 2.4, 2.3), (2.4, 2.9, 2.4)),
     ]
 )
 NAMES = ("view 0.png", "view 1.jpg", "view 2.png", "view 3.png", "view 4.jpg", "view 5.png", "view 6.png")

@@ -87,9 +87,8 @@ def test_noise_has_its_standard_deviation_in_sampsons_distance(t: tuple[float, f
     camera, pose = Camera.pinhole(600, 450, 2000.0), rigid.from_parts(np.eye(3), np.array(t))
     rng = np.random.default_rng(2)
     points = rng.uniform((-0.4, -0.3, 3), (0.4, 0.3, 8), (20_000, 3))
-    pixels = [
-        camera.project(rigid.apply(one, points))[0] + rng.normal(0, 0.7, (20_000, 2)) for one in (np.eye(4), pose)
-    ]
+    seen = [camera.project(rigid.apply(one, points))[0] for one in (np.eye(4), pose)]
+    pixels = [places + rng.normal(0, 0.7, (20_000, 2)) for places in seen]
     assert compared(camera, pixels, pose).sampson_px.std() == pytest.approx(0.7, rel=0.03)
 
 

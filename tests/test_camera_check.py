@@ -94,9 +94,8 @@ def test_exact_matches_determine_it_to_a_hundredth_of_a_per_cent():
 def test_the_error_is_that_of_leaving_out_each_tenth_of_the_photos():
     """The same check without the matches of these photos, in ten calls."""
     photos = ring(PINHOLE)
-    matches = [
-        replace(m, pixels=(m.pixels[0][::4], m.pixels[1][::4])) for m in matched(photos, noise_px=0.5, wrong=0.1)
-    ]
+    every = matched(photos, noise_px=0.5, wrong=0.1)
+    matches = [replace(m, pixels=(m.pixels[0][::4], m.pixels[1][::4])) for m in every]
     without = [
         checked(photos, [m for m in matches if left not in (m.photos[0] % 10, m.photos[1] % 10)]).log_focal
         for left in range(10)

@@ -53,9 +53,8 @@ class Examination:
     pairs: tuple[Pair, ...]
 
     def diagnosis(self) -> Diagnosis:
-        subject = ExaminedCapture(
-            self.folder, tuple(Source(fact.name, self.folder / fact.name) for fact in self.facts), None
-        )
+        sources = tuple(Source(fact.name, self.folder / fact.name) for fact in self.facts)
+        subject = ExaminedCapture(self.folder, sources, None)
         return judged(subject, list(self.facts), list(self.pairs), unreadable={})
 
     def spoilt(self, photo: np.ndarray, tmp_path: Path) -> Diagnosis:
@@ -309,9 +308,8 @@ def test_the_baseline_over_the_depth_is_measured_and_a_pure_rotation_recognized(
     views = estimate_motion(x, y, (focal_px, focal_px), within_px=2.0)
     assert views is not None
     assert views.flat == (baseline == 0)
-    assert views.baseline_over_depth == pytest.approx(
-        baseline / np.median(points[:, 2]), rel=0.1, abs=0.02 * views.flat
-    )
+    over_depth = baseline / np.median(points[:, 2])
+    assert views.baseline_over_depth == pytest.approx(over_depth, rel=0.1, abs=0.02 * views.flat)
 
 
 def test_a_plane_gives_no_more_than_its_baseline_over_its_distance():

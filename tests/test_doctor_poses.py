@@ -124,15 +124,7 @@ def test_true_poses_are_good_and_their_error_is_that_of_the_noise():
         lambda poses: {5: poses[4]},
         lambda poses: {5: turned(poses[5], 5.0), 6: turned(poses[6], -5.0), 7: turned(poses[7], 3.0)},
     ],
-    ids=[
-        "turned by 2",
-        "turned by 20",
-        "moved",
-        "neighbours swapped",
-        "far ones swapped",
-        "repeated",
-        "three in a row",
-    ],
+    ids=["by 2", "by 20", "moved", "neighbours swapped", "far ones swapped", "repeated", "three in a row"],
 )
 def test_wrong_poses_are_named_and_no_others(wrong: Callable[[list[np.ndarray]], dict[int, np.ndarray]]):
     frames = ring()
@@ -158,9 +150,7 @@ def test_two_pairs_and_pairs_of_few_matches_are_too_little_to_accuse():
     frames = ring()
     given = posed(frames, {5: turned(frames[5].world_from_cam, 10.0)})
     pairs = pairs_of(frames)
-    two = [
-        pair for pair in pairs if 5 not in (pair.first, pair.second) or (pair.first, pair.second) in ((4, 5), (5, 6))
-    ]
+    two = [p for p in pairs if 5 not in (p.first, p.second) or (p.first, p.second) in ((4, 5), (5, 6))]
     assert checked(given, two).photos == ()
     few = [replace(pair, inliers=25) if 5 in (pair.first, pair.second) else pair for pair in pairs]
     assert checked(given, few).photos == ()
@@ -170,9 +160,8 @@ def test_a_photo_between_two_wrong_ones_is_not_accused_by_them():
     """Photos 0 and 5 are wrong. Two of the three pairs of photo 1 are with them."""
     wrong = [(0, other) for other in (1, 2, 3, 4)] + [(5, other) for other in (1, 3, 4, 6)]
     right = [(1, 2), (2, 3), (3, 4), (4, 6), (2, 4), (3, 6)]
-    errors = [PairError(*pair, 100, 50.0, False) for pair in wrong] + [
-        PairError(*pair, 90, 0.2, False) for pair in right
-    ]
+    errors = [PairError(*pair, 100, 50.0, False) for pair in wrong]
+    errors += [PairError(*pair, 90, 0.2, False) for pair in right]
     assert sorted(contradicting(errors, 7, limit_px=4.0)) == [(0, 50.0), (5, 50.0)]
 
 

@@ -62,12 +62,10 @@ def test_photos_of_normal_spread_are_named_only_beyond_five_deviations(seed, cou
 def test_evaluation_warns_of_a_photo_that_shows_something_else():
     model = fog(torch.zeros(4, 4, 4, dtype=torch.bool), Similarity.identity(), background=(0.2, 0.2, 0.2))
     pose = look_at(np.array([0.0, 0.0, -3.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
-    levels = (70, 72, 74, 76, 78, 250)
+    frames = [Frame(f"{index}.png", Camera.pinhole(16, 12, 16.0), pose) for index in range(6)]
     held_out = [
-        HeldOutPhoto(
-            Frame(f"{index}.png", Camera.pinhole(16, 12, 16.0), pose), np.full((12, 16, 3), level, np.uint8), None
-        )
-        for index, level in enumerate(levels)
+        HeldOutPhoto(frame, np.full((12, 16, 3), level, np.uint8), None)
+        for frame, level in zip(frames, (70, 72, 74, 76, 78, 250), strict=True)
     ]
     metrics = evaluate_model(model, held_out)
     assert len(metrics.warnings) == 1

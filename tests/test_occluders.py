@@ -195,9 +195,8 @@ def test_a_pool_draws_no_pixel_that_is_left_out(is_masked):
     left_out = [generator.random((150, 200)) < 0.3, np.zeros((150, 200), bool)]
     pool = PixelPool(photos, SAME, torch.device("cpu")).without(left_out)
     wanted = [~mask if used is None else used & ~mask for mask in left_out]
-    whole = PixelPool(
-        [replace(one, used=mask) for one, mask in zip(photos, wanted, strict=True)], SAME, torch.device("cpu")
-    )
+    masked = [replace(one, used=mask) for one, mask in zip(photos, wanted, strict=True)]
+    whole = PixelPool(masked, SAME, torch.device("cpu"))
     assert pool.usable is not None
     assert whole.usable is not None
     assert pool.usable.tolist() == whole.usable.tolist()

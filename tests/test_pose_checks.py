@@ -173,9 +173,8 @@ def test_a_result_that_is_not_finite_is_written_as_null(job: Job, monkeypatch: p
     # There are no photos: their features are in the database already.
     monkeypatch.setattr(worker, "extract", lambda job, report: None)
     monkeypatch.setattr(worker, "mask_turning_object", lambda job, training: (job, None))
-    worker.solve(
-        replace(job, skipped_checks=(("another check", "too long"),)), lambda *progress: None, lambda note: None
-    )
+    job = replace(job, skipped_checks=(("another check", "too long"),))
+    worker.solve(job, lambda *progress: None, lambda note: None)
     content = json.loads((Path(job.folder) / "result.json").read_text(encoding="utf-8"))["content"]
     assert set(content["pose_blur_px"].values()) == {None}
 

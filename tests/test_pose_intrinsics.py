@@ -64,9 +64,7 @@ def unaided(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return scene
 
 
-def test_fixed_intrinsics_stay_to_the_last_bit_and_only_mapping_is_done_again(
-    photos: Path, unaided: Path, tmp_path: Path
-):
+def test_fixed_intrinsics_stay_to_the_bit_and_only_mapping_is_done_again(photos: Path, unaided: Path, tmp_path: Path):
     """Synthetic truth, rescaled exactly to each photo size; the poses are better than without given intrinsics."""
     scene, notes = shutil.copytree(unaided, tmp_path / "scene"), []
     given = Calibration(tmp_path / "cameras.txt", (TRUE,), {})

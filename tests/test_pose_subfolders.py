@@ -77,9 +77,7 @@ def test_each_subfolder_has_the_camera_that_took_its_photos(scene: Path):
     assert right / left == pytest.approx(ZOOM, rel=0.01)
 
 
-def test_the_scene_has_the_photos_of_both_and_is_kept_the_second_time(
-    rig: Path, scene: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_the_scene_has_the_photos_of_both_and_is_kept_later(rig: Path, scene: Path, monkeypatch: pytest.MonkeyPatch):
     loaded = load_scene(scene)
     names = [f"{folder}/{index}.png" for folder in ("left", "right") for index in range(PHOTOS)]
     assert sorted(frame.name for frame in loaded.frames) == names
@@ -196,7 +194,6 @@ def test_photos_behind_links_to_folders_are_found_once(tmp_path: Path):
     (tmp_path / "photos" / "again").symlink_to(tmp_path / "photos")
     (tmp_path / "photos" / "copy").symlink_to(tmp_path / "photos" / "right")
     (tmp_path / "photos" / "left").symlink_to(tmp_path / "elsewhere")
-    found = [
-        path.relative_to(tmp_path).as_posix() for path in list_photos(tmp_path / "photos", subfolders=True).pictures
-    ]
+    pictures = list_photos(tmp_path / "photos", subfolders=True).pictures
+    found = [path.relative_to(tmp_path).as_posix() for path in pictures]
     assert found == ["photos/left/a.jpg", "photos/right/a.jpg"]

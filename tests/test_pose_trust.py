@@ -188,9 +188,7 @@ def refused(solved: Solved, tmp_path_factory: pytest.TempPathFactory) -> Examine
     return examine(wrong.models, wrong.job)
 
 
-def test_a_contradicted_model_is_mapped_again_from_its_sound_part(
-    solved: Solved, refused: ExaminedModel, tmp_path: Path
-):
+def test_a_contradicted_model_is_mapped_from_its_sound_part(solved: Solved, refused: ExaminedModel, tmp_path: Path):
     """Synthetic truth: the three photos that were off by 40 degrees come out within 0.4 degrees."""
     assert is_contradicted(refused.verdict)
     chosen, notes = remapped(wrongly_mapped(solved, tmp_path / "again"), refused)
@@ -549,9 +547,8 @@ def test_turning_on_the_spot_with_an_off_centre_lens_is_recognised(tmp_path: Pat
     focal length 40 % too long. A rotation with two radial terms and a principal point fits as well.
     """
     lens = Lens("OPENCV", 1000, 750, (800.0, 805.0, 512.0, 370.0, -0.2, 0.08, 0.001, -0.002))
-    still = solve(
-        tmp_path, synthetic.panorama(12, lens, turn_deg=120), synthetic.room(2500, seed=0), Noise(features_px=0.25)
-    )
+    views = synthetic.panorama(12, lens, turn_deg=120)
+    still = solve(tmp_path, views, synthetic.room(2500, seed=0), Noise(features_px=0.25))
     measures = still.examined.verdict.measures
     assert still.model.num_reg_images() == 12
     assert measures["triangulation_angle_deg"] > 10

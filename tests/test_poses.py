@@ -114,9 +114,8 @@ def test_the_scene_folder_holds_the_model_and_of_the_work_what_helps_the_next(so
     assert {path.name for path in solved.scene.iterdir()} == {*results, "work"}
     assert {path.suffix for path in (solved.scene / "work").iterdir()} == {".json", ".lock"}
     assert {path.name for path in solved.scene.parent.iterdir()} == {"my photos", "corner"}
-    assert {"cameras.bin", "images.bin", "points3D.bin"} <= {
-        path.name for path in (solved.scene / "sparse/0").iterdir()
-    }
+    written = {path.name for path in (solved.scene / "sparse/0").iterdir()}
+    assert {"cameras.bin", "images.bin", "points3D.bin"} <= written
     assert solved.model.num_points3D() == solved.report.points > 200
     assert 0 < solved.report.mean_reprojection_error_px < 1
 
@@ -242,15 +241,12 @@ def test_a_scene_never_takes_the_place_of_photos_or_of_something_else(tmp_path: 
     assert (tmp_path / "thesis" / "chapter.tex").is_file()
 
 
-def test_a_folder_that_cannot_be_written_is_refused_before_photos_are_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_folder_that_is_read_only_is_refused_before_photos_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     write_noise(tmp_path / "photos")
     monkeypatch.setattr("nerfcli.atomic.os.access", lambda path, mode: False)
+    unread = Mock(side_effect=AssertionError)
     with pytest.raises(UserError, match="no write permission"):
-        estimate_poses(
-            tmp_path / "photos", tmp_path / "scene", settings=FAST, progress=Mock(side_effect=AssertionError)
-        )
+        estimate_poses(tmp_path / "photos", tmp_path / "scene", settings=FAST, progress=unread)
 
 
 @pytest.mark.parametrize(

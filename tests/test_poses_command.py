@@ -32,9 +32,7 @@ def test_what_is_no_amount_of_memory(text: str):
     ("options", "size", "features"),
     [((), 1600, 4096), (("--quality", "fast"), 1000, 2048), (("--quality", "best", "--max-size", "2000"), 2000, 8192)],
 )
-def test_a_dry_run_prints_the_plan_and_writes_nothing(
-    tmp_path: Path, options: tuple[str, ...], size: int, features: int
-):
+def test_a_dry_run_prints_its_plan_and_no_file(tmp_path: Path, options: tuple[str, ...], size: int, features: int):
     photos = write_photos(tmp_path / "photos", 5)
     result = nerfcli("poses", photos, "--dry-run", "--json", *options)
     plan = json.loads(result.stdout)

@@ -227,9 +227,8 @@ def test_the_camera_of_a_lens_has_the_median_principal_point():
 def test_a_pose_and_a_shift_are_found_on_fixed_points(seed):
     """Exact observations but for a tenth of wrong ones; the start is a degree and 2 % of the distance off."""
     rng = np.random.default_rng(seed)
-    camera = pycolmap.Camera(
-        camera_id=1, model="SIMPLE_RADIAL", width=1000, height=750, params=[800.0, 500.0, 375.0, 0.02]
-    )
+    params = [800.0, 500.0, 375.0, 0.02]
+    camera = pycolmap.Camera(camera_id=1, model="SIMPLE_RADIAL", width=1000, height=750, params=params)
     points = rng.uniform([-3, -2, 4], [3, 2, 9], size=(200, 3))
     shift = rng.normal(scale=10, size=2)
     pixels = np.asarray(camera.img_from_cam(points), dtype=np.float64) + shift

@@ -259,9 +259,8 @@ def test_the_page_shows_cameras_chosen_components_and_how_new_the_views_are(seen
         ledger=(Entry("poses", True, "all photos were matched"),),
     )
     decision = Decision("view", 0, 0.5, 0.1, None, -0.02, None, True, "so")
-    chosen = replace(
-        run, metrics=metrics, config=replace(run.config, selection=Selection(Components(), (decision,), 1.0))
-    )
+    config = replace(run.config, selection=Selection(Components(), (decision,), 1.0))
+    chosen = replace(run, metrics=metrics, config=config)
     text = page_html([chosen], [look], depths=[_meta()])
     for cell in ("0.123", "5.7", "extrapolation", "all photos were matched", "19.50 dB (3)"):
         assert cell in text
@@ -274,9 +273,8 @@ def test_numbers_that_must_not_be_compared_are_named():
     one = facts()
     assert list(mismatches_of([one, facts("b")])) == []
     assert one.metrics is not None
-    foreign = replace(
-        one, config=RunConfig(split_sha256="2"), metrics=replace(one.metrics, protocol="x", device="cuda")
-    )
+    metrics = replace(one.metrics, protocol="x", device="cuda")
+    foreign = replace(one, config=RunConfig(split_sha256="2"), metrics=metrics)
     reported = list(mismatches_of([one, foreign]))
     assert len(reported) == 3
     assert "have different held-out photos" in reported[0]
@@ -289,9 +287,8 @@ def test_everything_that_was_warned_about_is_listed():
         "attempts": [{"what": "default thresholds"}, {"what": "full size", "doubt": "two sides may look alike"}],
         "pose_blur_px": {"largest": 3.21, "photo": "d.png"},
     }
-    run = facts(
-        poses=poses, metrics=None, config=RunConfig(missing_photos=("e.png",), warnings=("intrinsics were halved",))
-    )
+    config = RunConfig(missing_photos=("e.png",), warnings=("intrinsics were halved",))
+    run = facts(poses=poses, metrics=None, config=config)
     run.log.append(logged(30, 0.01, rollbacks=2))
     reported = [f"{stage}: {text}" for stage, text in warnings_of(run)]
     for part in (

@@ -36,8 +36,8 @@ def test_a_painted_background_has_the_colours_of_its_directions():
 
     def seen() -> tuple[Tensor, Tensor]:
         directions = torch.nn.functional.normalize(torch.randn(4096, 3, generator=generator), dim=-1)
-        up, down = torch.tensor([0.2, 0.4, 0.9]), torch.tensor([0.5, 0.3, 0.1])
-        return directions, torch.where(directions[:, 2:] > 0, up, down)
+        above, below = torch.tensor([0.2, 0.4, 0.9]), torch.tensor([0.5, 0.3, 0.1])
+        return directions, torch.where(directions[:, 2:] > 0, above, below)
 
     background = SphereBackground()
     paint(background, seen)

@@ -141,9 +141,8 @@ def test_depths_are_pixels_of_the_pool_in_its_frame():
     depths = found(photos)
     of_stereo = dense_points(depths, pool)
     rays = pool.rays_of(of_stereo.numbers)
-    points = similarity.inverse().apply(
-        (rays.origins + rays.directions * of_stereo.distances[:, None]).double().numpy()
-    )
+    ends = rays.origins + rays.directions * of_stereo.distances[:, None]
+    points = similarity.inverse().apply(ends.double().numpy())
     assert np.median(np.abs((points @ NORMALS.T).max(-1) - 3.0)) < 0.02
     errors = np.concatenate([depth.errors for depth in depths])
     assert of_stereo.trust.numpy() == pytest.approx(1 / (1 + (errors / 0.05) ** 2), rel=1e-5)

@@ -410,9 +410,7 @@ class TestPoses:
         assert np.asarray(Image.open(scene_masks(job) / f"{job.names[0]}.png")).all()
         assert mask_turning_object(job, lambda note: None)[0].masks == expected
 
-    def test_a_photo_that_gets_no_mask_any_more_has_no_earlier_one(
-        self, job: Job, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_photo_that_gets_no_mask_any_more_has_no_old_one(self, job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
         make = module._make_masks
         monkeypatch.setattr(module, "_make_masks", lambda *some, **more: [None, *make(*some, **more)[1:]])
         _, facts = mask_turning_object(job, lambda note: None)
@@ -421,9 +419,7 @@ class TestPoses:
         there = [(scene_masks(job) / f"{name}.png").exists() for name in job.names]
         assert there == [False] + [True] * (len(job.names) - 1)
 
-    def test_an_edited_mask_of_a_photo_that_was_saved_again_is_kept(
-        self, job: Job, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_an_edited_mask_of_a_photo_saved_again_is_kept(self, job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
         make, path = module._make_masks, scene_masks(job) / f"{job.names[0]}.png"
         Image.fromarray(~np.asarray(Image.open(path))).save(path)
         edited = path.read_bytes()
