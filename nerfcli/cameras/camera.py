@@ -49,8 +49,7 @@ class Camera:
     def __post_init__(self) -> None:
         if self.model not in DISTORTIONS:
             raise UserError(
-                f"unknown camera model {self.model!r}",
-                f"expected one of COLMAP's: {', '.join(sorted(DISTORTIONS))}",
+                f"unknown camera model {self.model!r}", f"expected one of COLMAP's: {', '.join(sorted(DISTORTIONS))}"
             )
         if self.width < 1 or self.height < 1:
             raise UserError(

@@ -70,8 +70,7 @@ def fly(world_from_cam: np.ndarray, count: int) -> np.ndarray:
     t = np.arange(samples * len(times) + 1) / samples
     along = rotation(t)
     steps = np.maximum(
-        np.linalg.norm(np.diff(position(t), axis=0), axis=1),
-        per_radian * (along[:-1].inv() * along[1:]).magnitude(),
+        np.linalg.norm(np.diff(position(t), axis=0), axis=1), per_radian * (along[:-1].inv() * along[1:]).magnitude()
     )
     length = np.concatenate([[0.0], np.cumsum(steps)])
     at = np.interp(np.linspace(0.0, length[-1], count), length, t)

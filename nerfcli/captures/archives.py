@@ -138,11 +138,7 @@ def _is_kept(folder: Path, content: dict[str, Any], path: Path, *, overwrite: bo
 
 
 def _extract(
-    archive: zipfile.ZipFile,
-    members: list[zipfile.ZipInfo],
-    folder: Path,
-    content: dict[str, Any],
-    progress: Progress,
+    archive: zipfile.ZipFile, members: list[zipfile.ZipInfo], folder: Path, content: dict[str, Any], progress: Progress
 ) -> None:
     total = sum(entry.file_size for entry in members)
     home = next(parent for parent in folder.parents if parent.exists())

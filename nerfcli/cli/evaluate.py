@@ -15,11 +15,7 @@ if TYPE_CHECKING:
     from nerfcli.evaluate.requirements import Requirement
     from nerfcli.workflows.evaluate import Evaluation
 
-_COLUMNS = {
-    "as rendered": "",
-    "unrounded": "_float",
-    "colours aligned": "_colour_aligned",
-}
+_COLUMNS = {"as rendered": "", "unrounded": "_float", "colours aligned": "_colour_aligned"}
 _MEASURES = (("psnr", 2), ("ssim", 4), ("lpips", 4))
 
 

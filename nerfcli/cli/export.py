@@ -24,8 +24,7 @@ class SurfaceOptions:
         typer.Option(help="Exported region X0,Y0,Z0,X1,Y1,Z1, in scene units.  [default: the subject of the photos]"),
     ] = None
     voxel_size: Annotated[
-        float | None,
-        typer.Option(help="Size of a voxel in scene units.  [default: the resolution of the photos]"),
+        float | None, typer.Option(help="Size of a voxel in scene units.  [default: the resolution of the photos]")
     ] = None
     faces: Annotated[
         int | None,
@@ -63,8 +62,7 @@ class SplatOptions:
         str | None, typer.Option(help="Time to refine splats on the training photos.  [default: 60s]")
     ] = None
     sh: Annotated[
-        int | None,
-        typer.Option(help="Degree of the spherical harmonics of splat colours.  [default: 2]", min=0, max=3),
+        int | None, typer.Option(help="Degree of the spherical harmonics of splat colours.  [default: 2]", min=0, max=3)
     ] = None
     frame: Annotated[
         str | None,
@@ -97,11 +95,7 @@ def export(
     to: Annotated[str, typer.Option("--to", help="What to export: page, mesh, points or splats.")],
     *,
     form: Annotated[
-        str | None,
-        typer.Option(
-            "--format",
-            help="File format if -o does not determine it: ply, glb, obj, spz, html.",
-        ),
+        str | None, typer.Option("--format", help="File format if -o does not determine it: ply, glb, obj, spz, html.")
     ] = None,
     surface: SurfaceOptions,
     splats: SplatOptions,

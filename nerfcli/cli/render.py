@@ -22,8 +22,7 @@ class ViewOptions:
     """Options of the cameras, and of the size and lens of the pictures."""
 
     cameras: Annotated[
-        str,
-        typer.Option(help="test, train, orbit, ellipse, spiral, interpolate, or any capture that convert reads."),
+        str, typer.Option(help="test, train, orbit, ellipse, spiral, interpolate, or any capture that convert reads.")
     ] = "test"
     through: Annotated[
         str | None,
@@ -63,8 +62,7 @@ class ViewOptions:
         ),
     ] = None
     cameras_only: Annotated[
-        bool,
-        typer.Option("--cameras-only", help="Render nothing; only write cameras.json and camera_path.json."),
+        bool, typer.Option("--cameras-only", help="Render nothing; only write cameras.json and camera_path.json.")
     ] = False
 
     def views(self) -> "Views":
@@ -109,8 +107,7 @@ class DepthOptions:
         ),
     ] = "conditional"
     depth_axis: Annotated[
-        str | None,
-        typer.Option(help="ray: along the ray; z: along the optical axis.  [default: z, ray for panoramas]"),
+        str | None, typer.Option(help="ray: along the ray; z: along the optical axis.  [default: z, ray for panoramas]")
     ] = None
     min_opacity: Annotated[
         float,

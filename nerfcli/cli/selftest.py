@@ -28,11 +28,7 @@ _STYLES = {"met": "green", "not met": "bold red"}
 
 
 @command
-def selftest(
-    device: Device = "auto",
-    *,
-    printing: Printing,
-) -> None:
+def selftest(device: Device = "auto", *, printing: Printing) -> None:
     """Check the numerical accuracy of the kernels on hard cases.
 
     Compares the kernels in float32, in bfloat16, as compiled for the CPU and, with --device cuda, for the GPU, with

@@ -64,7 +64,7 @@ class Fit:
     model: Annotated[
         str,
         typer.Option(
-            help="auto: select components for this scene with short trainings; default: use the default components.",
+            help="auto: select components for this scene with short trainings; default: use the default components."
         ),
     ] = "auto"
     contraction: Annotated[

@@ -66,14 +66,7 @@ class SplatSettings:
     resume: bool | None = False
 
 
-def export_splats(
-    run: Run,
-    model: Model,
-    path: Path,
-    *,
-    settings: SplatSettings,
-    reporter: Reporter,
-) -> None:
+def export_splats(run: Run, model: Model, path: Path, *, settings: SplatSettings, reporter: Reporter) -> None:
     """Write the splats of a run as .ply, .spz or .html; make and refine them first if the run does not have them.
 
     Raises:

@@ -259,9 +259,5 @@ BINARY = Format(
 
 
 TEXT = replace(
-    BINARY,
-    name="colmap-text",
-    of="a COLMAP model as text",
-    write=write_colmap_text,
-    losses=losses_colmap_text,
+    BINARY, name="colmap-text", of="a COLMAP model as text", write=write_colmap_text, losses=losses_colmap_text
 )

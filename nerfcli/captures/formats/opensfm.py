@@ -61,10 +61,7 @@ _TERMS = {
 _SPHERICAL = ("spherical", "equirectangular")
 
 # Terms that OpenSfM lacks. The tangential and prism terms of RAD_TAN_THIN_PRISM_FISHEYE act on other coordinates.
-_LOST_TERMS = {
-    "FULL_OPENCV": ("k4", "k5", "k6"),
-    "RAD_TAN_THIN_PRISM_FISHEYE": ("p0", "p1", "s0", "s1", "s2", "s3"),
-}
+_LOST_TERMS = {"FULL_OPENCV": ("k4", "k5", "k6"), "RAD_TAN_THIN_PRISM_FISHEYE": ("p0", "p1", "s0", "s1", "s2", "s3")}
 # The types of the lenses of COLMAP's models that are not written as "brown" or "fisheye_opencv".
 _TYPES = {
     "SIMPLE_RADIAL": "simple_radial",

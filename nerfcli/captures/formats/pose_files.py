@@ -106,10 +106,7 @@ def _cameras(folder: Path, camera: Camera | None, fits: Fits) -> Callable[[tuple
         return lambda size: camera.resized(*size)
     path = next((folder / name for name in _INTRINSICS if (folder / name).is_file()), None)
     if path is None:
-        raise UserError(
-            f"{folder} has poses but no file of intrinsics, such as {_INTRINSICS[0]}",
-            GIVE_CAMERA,
-        )
+        raise UserError(f"{folder} has poses but no file of intrinsics, such as {_INTRINSICS[0]}", GIVE_CAMERA)
     rows = [line.split() for _, line in content_lines(read_text(path, "expected a matrix of intrinsics"))]
     lengths = [len(row) for row in rows]
     if lengths in ([3] * 3, [4] * 3, [4] * 4):

@@ -61,10 +61,5 @@ def find_scanner_app(path: Path) -> Path | None:
 
 
 FORMAT = Format(
-    "3d-scanner-app",
-    "3D Scanner App",
-    "frame_00000.json",
-    find_scanner_app,
-    parse_scanner_app,
-    axes="opengl",
+    "3d-scanner-app", "3D Scanner App", "frame_00000.json", find_scanner_app, parse_scanner_app, axes="opengl"
 )

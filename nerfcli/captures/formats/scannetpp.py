@@ -57,10 +57,5 @@ def find_scannetpp(path: Path) -> Path | None:
 
 
 FORMAT = Format(
-    "scannetpp",
-    "ScanNet++",
-    "dslr/nerfstudio/transforms.json",
-    find_scannetpp,
-    parse_scannetpp,
-    axes="opengl",
+    "scannetpp", "ScanNet++", "dslr/nerfstudio/transforms.json", find_scannetpp, parse_scannetpp, axes="opengl"
 )

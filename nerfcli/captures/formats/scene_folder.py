@@ -142,9 +142,7 @@ def _listed_depths(content: dict[str, Any], path: Path, place: Callable[[str], P
     try:
         return {
             name: SensorDepth(
-                place(one["path"]),
-                float(one["unit"]),
-                None if one["confidence"] is None else place(one["confidence"]),
+                place(one["path"]), float(one["unit"]), None if one["confidence"] is None else place(one["confidence"])
             )
             for name, one in dict(listed).items()
         }
@@ -174,10 +172,7 @@ def parse_scene(root: Path, given: UserInputs = UserInputs()) -> Capture:
     path = root / SCENE_FILE
     content = read_json_object(path)
     if content.get("measurement") == "transmission":
-        raise UserError(
-            f"{root} is an X-ray scan, not a scene of photos",
-            f"use nerfcli ct train {in_shell(root)}",
-        )
+        raise UserError(f"{root} is an X-ray scan, not a scene of photos", f"use nerfcli ct train {in_shell(root)}")
     if content.get("version") != SCENE_VERSION:
         raise UserError(
             f"{path}: unknown version {content.get('version')!r}, expected {SCENE_VERSION}",

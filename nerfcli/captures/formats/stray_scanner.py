@@ -109,10 +109,5 @@ def video_of(folder: Path) -> Path | None:
 
 
 FORMAT = Format(
-    "stray-scanner",
-    "Stray Scanner",
-    ODOMETRY,
-    folder_with(ODOMETRY, MATRIX),
-    parse_stray_scanner,
-    video=video_of,
+    "stray-scanner", "Stray Scanner", ODOMETRY, folder_with(ODOMETRY, MATRIX), parse_stray_scanner, video=video_of
 )
