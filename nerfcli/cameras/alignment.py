@@ -72,9 +72,6 @@ def align_robustly(x: np.ndarray, y: np.ndarray) -> Alignment:
 
     Args:
         x, y: (N, 3), N >= 2.
-
-    Raises:
-        ValueError: see `align`.
     """
     count = len(x)
     everywhere = np.ones(count, dtype=bool)

@@ -268,11 +268,7 @@ class Camera:
 
     @staticmethod
     def from_json(content: dict[str, Any]) -> "Camera":
-        """Return the camera that `to_json` described.
-
-        Raises:
-            UserError: a key is missing or has an invalid value.
-        """
+        """Return the camera that `to_json` described."""
         try:
             model, params = str(content["model"]), tuple(float(value) for value in content["params"])
             width, height = int(content["width"]), int(content["height"])

@@ -28,9 +28,6 @@ def sized(camera: Camera, width: int | None, height: int | None) -> Camera:
     If only one of width and height is given, the other follows from the aspect ratio. Where the aspect ratio changes,
     the scaled picture covers the new one and is cropped evenly on two sides: the scale is s = max(W / w, H / h), and
     the principal point moves by (W - s w) / 2 and (H - s h) / 2.
-
-    Raises:
-        UserError: an equirectangular picture whose width would not be twice its height.
     """
     if width is None and height is None:
         return camera
@@ -77,9 +74,6 @@ def with_lens(camera: Camera, lens: str, fov_deg: float | None) -> Camera:
 
     Args:
         fov_deg: angle between the left and right edge in degrees; None for the default of the lens.
-
-    Raises:
-        UserError: the angle is out of range for the lens.
     """
     width, height = camera.width, camera.height
     if lens == "equirectangular":

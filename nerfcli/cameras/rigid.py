@@ -194,11 +194,7 @@ class Similarity:
 
     @staticmethod
     def from_json(content: dict[str, Any]) -> "Similarity":
-        """Return the similarity that `to_json` described.
-
-        Raises:
-            UserError: a key is missing, a shape or number is wrong, or the rotation is invalid.
-        """
+        """Return the similarity that `to_json` described."""
         try:
             scale = float(content["scale"])
             rotation = np.array(content["rotation"], dtype=np.float64)

@@ -92,9 +92,6 @@ def reinterpreted(capture: Capture, true_convention: Convention, *, parsed_axes:
 
     Args:
         parsed_axes: the camera axes that the format prescribes.
-
-    Raises:
-        UserError: the axes are unknown.
     """
     poses = reinterpreted_poses(poses_of(capture), true_convention, parsed_axes=parsed_axes)
     shift = 0.5 - true_convention.pixel_centre

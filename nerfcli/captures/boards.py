@@ -273,10 +273,6 @@ def scale_from_markers(frames: Sequence[Frame], side: float, *, dictionary: str)
         frames: with cameras that fit the photos on disk, see `orientation.upright`.
         side: length of the black square's side in metres.
         dictionary: OpenCV's name, such as DICT_4X4_50.
-
-    Raises:
-        UserError: an unknown dictionary, an invalid side, a photo that cannot be read, or no marker that two photos
-            show.
     """
     if not 0 < side < np.inf:
         raise UserError(f"invalid side length of markers: {side:g} m", "expected a positive length in metres")
@@ -306,10 +302,6 @@ def scale_from_charuco(frames: Sequence[Frame], board: CharucoBoard) -> ScaleEst
     Args:
         frames: with cameras that fit the photos on disk, see `orientation.upright`.
         board: as it was printed.
-
-    Raises:
-        UserError: an unknown dictionary or one with too few markers, a photo that cannot be read, or no corners that
-            two photos show.
     """
     dictionary = _dictionary(board.dictionary)
     if board.columns * board.rows // 2 > len(dictionary.bytesList):

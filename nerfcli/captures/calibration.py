@@ -120,11 +120,7 @@ _CAMERAS_FILES = ("cameras.bin", "cameras.txt")
 
 
 def read_intrinsics(path: Path) -> Camera:
-    """Read the camera in a file, see `read_calibration`.
-
-    Raises:
-        UserError: there is no camera, there are several different ones, or the file is damaged.
-    """
+    """Read the camera in a file, see `read_calibration`."""
     cameras = read_calibration(path).cameras
     if len(cameras) != 1:
         raise UserError(
@@ -140,9 +136,6 @@ def read_calibration(path: Path, *, images: Path | None = None) -> Calibration:
 
     Args:
         images: the folder of the photos, for formats whose files do not state the photos' sizes.
-
-    Raises:
-        UserError: there is no camera, or the file is damaged.
     """
     content = read_json_object(path) if path.is_file() and find_json(path, opening="{", name="") else {}
     if "params" in content:

@@ -44,9 +44,6 @@ def check(capture: Capture, again: Capture, form: Format, *, own_lenses: bool) -
 
     Args:
         own_lenses: compare poses only, with the lenses of the capture for both.
-
-    Raises:
-        UserError: there are other points, or another number of views.
     """
     if "points" not in form.lacks and not np.array_equal(again.points, capture.points):
         raise differs(f"{len(again.points)} points instead of {len(capture.points)}, or other positions")
@@ -136,9 +133,6 @@ def load(source: Path, given: UserInputs, convention: Convention) -> tuple[Forma
 
     Returns:
         The format, the file or folder that was parsed, the capture.
-
-    Raises:
-        UserError: see `recognise_given`, or the capture is damaged, or the given axes are invalid.
     """
     form, found = recognise_given(source, given)
     capture = form.parse(found, given)
@@ -196,11 +190,7 @@ def target_path(target: Path, wanted: TargetOptions) -> Path:
 
 
 def accepted_losses(capture: Capture, wanted: TargetOptions, others: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """Return the contents of a capture that the format cannot hold, after other losses.
-
-    Raises:
-        UserError: they are not allowed.
-    """
+    """Return the contents of a capture that the format cannot hold, after other losses, if they are allowed."""
     form = wanted.form
     assert form.losses is not None
     losses = (*others, *form.losses(capture))

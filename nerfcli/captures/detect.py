@@ -99,9 +99,6 @@ def detect(capture: Capture, *, axes: str, progress: Callable[[float, str], None
     Args:
         axes: the camera axes that the format prescribes.
         progress: called with the fraction of the work that is done, and a short text.
-
-    Raises:
-        UserError: there is no evidence.
     """
     evidence = _evidence(capture, progress)
     declared = Convention(axes)

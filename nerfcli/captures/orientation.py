@@ -195,9 +195,6 @@ def in_pixels(capture: Capture, pixels: str) -> ReorientedCapture:
     """Return the capture with cameras, poses and observations for stored or upright pixels, at the cameras' own size.
 
     Frames without a photo on disk are left as they are, and reported.
-
-    Raises:
-        UserError: a photo cannot be read or turned, or has another shape than its camera.
     """
     if capture.pixels == pixels:
         return ReorientedCapture(capture)

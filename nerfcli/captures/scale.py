@@ -112,11 +112,7 @@ class KnownDistance:
 
 
 def known_distance(text: str, frames: Sequence[Frame]) -> KnownDistance:
-    """Parse "A B METRES" or "A B METRES+-ERROR"; A and B are names of images or points x,y,z.
-
-    Raises:
-        UserError: the text has another form, an image is unknown, or the length is invalid.
-    """
+    """Parse "A B METRES" or "A B METRES+-ERROR"; A and B are names of images or points x,y,z."""
     try:
         first, second, length = shlex.split(text)
         length, stated, tolerance = length.replace("±", "+-").partition("+-")
@@ -176,11 +172,7 @@ _ENOUGH_TO_TELL = 6
 
 
 def gps_positions(frames: Sequence[Frame]) -> dict[str, Position]:
-    """Read the GPS positions of photos from EXIF, by frame name; photos without a position are omitted.
-
-    Raises:
-        UserError: a photo cannot be read.
-    """
+    """Read the GPS positions of photos from EXIF, by frame name; photos without a position are omitted."""
     found = {frame.name: read_exif(frame.image).gps for frame in frames if frame.image is not None}
     return {name: gps for name, gps in found.items() if gps is not None}
 
@@ -240,11 +232,7 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
 
 
 def point_of(text: str, hint: str) -> np.ndarray:
-    """Parse a point (3,) from "x,y,z".
-
-    Raises:
-        UserError: the text is not a point; `hint` says what is expected.
-    """
+    """Parse a point (3,) from "x,y,z"; `hint` says what is expected."""
     try:
         point = np.array([float(part) for part in text.split(",")])
     except ValueError as error:

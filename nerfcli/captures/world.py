@@ -52,9 +52,6 @@ def up_aligned(frames: Sequence[Frame], axis: str) -> Similarity:
     Args:
         frames: give the up direction through `up_direction`.
         axis: x, y, z, -x, -y or -z.
-
-    Raises:
-        UserError: an unknown axis.
     """
     if axis not in WORLD_AXES:
         raise UserError(
@@ -132,11 +129,7 @@ class Moved:
 
 
 def in_world_frame(capture: Capture, wanted: WorldFrame) -> Moved:
-    """Move a capture to another world frame: first the origin, then the up axis, then the scale about that origin.
-
-    Raises:
-        UserError: a property is invalid or cannot be estimated; or for the up axis, see `in_pixels`.
-    """
+    """Move a capture to another world frame: first the origin, then the up axis, then the scale about that origin."""
     _check_combination(wanted)
     estimate = _estimate(capture, wanted)
     change = Similarity.identity()

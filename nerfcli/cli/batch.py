@@ -57,11 +57,7 @@ class Given:
     taken: dict[Path, Path] = field(default_factory=dict)
 
     def refuse_taken(self, result: Path) -> None:
-        """Refuse a path that is also that of the result of another input; with --overwrite, only the last would stay.
-
-        Raises:
-            UserError: another input has this result.
-        """
+        """Refuse a path that is the result of another input, too; with --overwrite, only the last would stay."""
         if (other := self.taken.setdefault(result, self.path)) != self.path:
             raise UserError(
                 f"{result} is the result of {other}, which has the same name",

@@ -87,11 +87,7 @@ class SourceOptions:
     ] = None
 
     def convention(self) -> "Convention":
-        """Return the convention of the source.
-
-        Raises:
-            typer.BadParameter: a value is unknown.
-        """
+        """Return the convention of the source."""
         from nerfcli.captures.axes import Convention
 
         centre = _pixel_centre(self.from_pixel_center, "--from-pixel-center")
@@ -167,11 +163,7 @@ class FormatOptions:
     overwrite: Overwrite = False
 
     def target(self) -> "TargetOptions":
-        """Return how to write.
-
-        Raises:
-            typer.BadParameter: a value is missing or unknown.
-        """
+        """Return how to write."""
         from nerfcli.captures.axes import Convention
         from nerfcli.captures.conversion import TargetOptions
         from nerfcli.captures.formats.registry import format_named
@@ -332,9 +324,6 @@ def place_of(given: Given, target: Path) -> Path:
     """Return where an input is converted to: of several, to a path in the folder `target` that is named after it.
 
     This is a file's name without suffix, or that of its folder if its own tells nothing.
-
-    Raises:
-        UserError: another input has this name.
     """
     if not given.one_of_many:
         return target

@@ -92,11 +92,7 @@ def show_findings(diagnosis: "Diagnosis | ScanDiagnosis", page: Path, record: di
 
 
 def check_gate(findings: Sequence[Finding], require: str | None) -> None:
-    """Raise if a finding is worse than required.
-
-    Raises:
-        UserError: a finding is worse.
-    """
+    """Refuse findings that are worse than required, with the exit code `GATE_NOT_MET`."""
     if require is None:
         return
     worse = [f for f in findings if VERDICTS.index(f.verdict) > VERDICTS.index(require)]

@@ -87,11 +87,7 @@ def evaluate(
 
 
 def requirements_of(text: str | None) -> "tuple[Requirement, ...]":
-    """Parse the requirements of --require.
-
-    Raises:
-        typer.BadParameter: the text cannot be parsed.
-    """
+    """Parse the requirements of --require."""
     from nerfcli.evaluate.requirements import parse_requirements
 
     try:

@@ -32,12 +32,7 @@ class SurfaceOptions:
     ] = None
 
     def settings(self) -> "SurfaceSettings":
-        """Return the settings that the options select.
-
-        Raises:
-            typer.BadParameter: a value cannot be parsed, or is no size.
-            UserError: the box is none.
-        """
+        """Return the settings that the options select."""
         from nerfcli.export.extent import FACES, SurfaceSettings
 
         finite(self.voxel_size, "--voxel-size")
@@ -73,11 +68,7 @@ class SplatOptions:
     ] = False
 
     def settings(self) -> "SplatSettings":
-        """Return the settings that the options select.
-
-        Raises:
-            typer.BadParameter: a value cannot be parsed.
-        """
+        """Return the settings that the options select."""
         from nerfcli.workflows.splats import SplatSettings
 
         return SplatSettings(

@@ -1,4 +1,7 @@
-"""Options shared by several commands, alone and as records, and the parsers of their values."""
+"""Options shared by several commands, alone and as records, and the parsers of their values.
+
+Whatever cannot be parsed, is unknown, or contradicts another option is a `typer.BadParameter` that names the option.
+"""
 
 import math
 import re
@@ -106,11 +109,7 @@ class Training(Computing):
     seed: Seed = 0
 
     def settings(self, budget: str | None, steps: int | None = None) -> "TrainSettings":
-        """Return the settings of a training whose components are selected.
-
-        Raises:
-            typer.BadParameter: a value cannot be parsed.
-        """
+        """Return the settings of a training whose components are selected."""
         from nerfcli.training.runs.settings import TrainSettings
 
         one_of(self.downscale, ("auto", "1", "2", "4", "8"), "--downscale")
@@ -144,11 +143,7 @@ _SECONDS_PER_UNIT = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
 def one_of(value: Word, choices: Collection[str], option: str) -> Word:
-    """Return an option's value if it is one of the choices; None if it is not given.
-
-    Raises:
-        typer.BadParameter: the value is not one of the choices.
-    """
+    """Return an option's value if it is one of the choices; None if it is not given."""
     if value is not None and value not in choices:
         *others, last = choices
         listed = f"{', '.join(others)} or {last}" if others else last
@@ -157,11 +152,7 @@ def one_of(value: Word, choices: Collection[str], option: str) -> Word:
 
 
 def some_of(text: str, choices: Collection[str], option: str) -> tuple[str, ...]:
-    """Return the items of a comma-separated list, without duplicates.
-
-    Raises:
-        typer.BadParameter: an item is not one of the choices.
-    """
+    """Return the items of a comma-separated list, without duplicates."""
     chosen = tuple(dict.fromkeys(name.strip() for name in text.split(",")))
     if unknown := [name for name in chosen if name not in choices]:
         raise typer.BadParameter(f"{unknown[0]!r}; choose from {', '.join(choices)}", param_hint=option)
@@ -169,32 +160,20 @@ def some_of(text: str, choices: Collection[str], option: str) -> tuple[str, ...]
 
 
 def finite(value: float | None, option: str) -> None:
-    """Refuse NaN and infinity, which the bounds of an option do not exclude.
-
-    Raises:
-        typer.BadParameter: the value is NaN or infinite.
-    """
+    """Refuse NaN and infinity, which the bounds of an option do not exclude."""
     if value is not None and not math.isfinite(value):
         raise typer.BadParameter(f"{value} is not a finite number", param_hint=option)
 
 
 def refuse_unused(unused: dict[str, tuple[bool, str]], words: str) -> None:
-    """Refuse options that nothing would use; by option, whether that is so, and with what it works.
-
-    Raises:
-        typer.BadParameter: there is one.
-    """
+    """Refuse options that nothing would use; by option, whether that is so, and with what it works."""
     for option, (is_unused, suited) in unused.items():
         if is_unused:
             raise typer.BadParameter(words.format(suited), param_hint=option)
 
 
 def seconds_from_text(text: str, option: str = "--budget") -> float:
-    """Parse 90s, 5m, 1.5h or plain seconds, the value of an option.
-
-    Raises:
-        typer.BadParameter: anything else, zero, or less than `FEWEST_PLAIN_SECONDS` without a unit: 2 may mean minutes.
-    """
+    """Parse 90s, 5m, 1.5h or plain seconds, the value of an option."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smh]?)", text.strip())
     seconds = float(match[1]) * _SECONDS_PER_UNIT[match[2] or "s"] if match else 0.0
     if not seconds > 0:
@@ -205,11 +184,7 @@ def seconds_from_text(text: str, option: str = "--budget") -> float:
 
 
 def bytes_from_text(text: str, option: str = "--memory") -> int:
-    """Parse 4GB, 500MB or 1.5GiB, the value of an option; a plain number is bytes.
-
-    Raises:
-        typer.BadParameter: anything else, or less than a kilobyte, which suggests a forgotten unit.
-    """
+    """Parse 4GB, 500MB or 1.5GiB, the value of an option; a plain number is bytes, which 4 alone can hardly mean."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(?:([kmgt])(i?)b?|b)?", text.strip().lower())
     size = int(float(match[1]) * (1024 if match[3] else 1000) ** " kmgt".index(match[2] or " ")) if match else 0
     if size < 1000:
@@ -218,11 +193,7 @@ def bytes_from_text(text: str, option: str = "--memory") -> int:
 
 
 def holdout_rule(holdout: str | None) -> str | None:
-    """Parse --holdout, with the path of a file made absolute; None if it is not given.
-
-    Raises:
-        typer.BadParameter: neither a rule nor a file.
-    """
+    """Parse --holdout, with the path of a file made absolute; None if it is not given."""
     try:
         return None if holdout is None else check_holdout(holdout)
     except ValueError as error:

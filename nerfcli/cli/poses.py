@@ -44,11 +44,7 @@ class PhotoOptions:
     holdout: options.Holdout = None
 
     def settings(self, seed: int, threads: int) -> "PoseSettings":
-        """Return the settings that the options select.
-
-        Raises:
-            typer.BadParameter: a value cannot be parsed.
-        """
+        """Return the settings that the options select."""
         from nerfcli.captures.holdout import DEFAULT_HOLDOUT
         from nerfcli.poses.input.settings import QUALITIES, PoseSettings
 
@@ -88,11 +84,7 @@ class MatchingOptions:
     ] = False
 
     def added_to(self, settings: "PoseSettings") -> "PoseSettings":
-        """Return the settings with these.
-
-        Raises:
-            typer.BadParameter: a value is unknown, or two exclude each other.
-        """
+        """Return the settings with these."""
         from nerfcli.poses.input.pairs import PAIRINGS
         from nerfcli.poses.input.settings import CAMERA_MODELS
 

@@ -66,11 +66,7 @@ class ViewOptions:
     ] = False
 
     def views(self) -> "Views":
-        """Return the views that the options select.
-
-        Raises:
-            typer.BadParameter: a value is unknown or cannot be parsed, or two exclude each other.
-        """
+        """Return the views that the options select."""
         from nerfcli.workflows.views import Views
 
         if self.max_size is not None and (self.width is not None or self.height is not None):
@@ -129,11 +125,7 @@ class DepthOptions:
     ] = None
 
     def request(self, outputs: tuple[str, ...]) -> "DepthRequest":
-        """Return the definition of depth that the options select; along z where no axis is given.
-
-        Raises:
-            typer.BadParameter: a value is unknown or not finite, or limits are given without depth.
-        """
+        """Return the definition of depth that the options select; along z where no axis is given."""
         from nerfcli.render.depth import AXES, CONVENTIONS, DepthRequest, is_convention
 
         if not is_convention(self.depth):
@@ -205,11 +197,7 @@ class FileOptions:
         return self.video or self.video_format is not None
 
     def settings(self, depth: DepthOptions, cameras: str) -> "RenderSettings":
-        """Return the settings that the options select.
-
-        Raises:
-            typer.BadParameter: a value is unknown, or two exclude each other.
-        """
+        """Return the settings that the options select."""
         from nerfcli.render.job import OUTPUTS, RenderSettings
 
         outputs = some_of(self.outputs, OUTPUTS, "--outputs")
@@ -377,9 +365,6 @@ def frame_range(text: str) -> slice:
     """Parse --frames: START:STOP or START:STOP:STEP, counted from 0, or K/N, every N-th view from the K-th.
 
     START and STOP may be left out; K counts from 1, as task numbers of array jobs do.
-
-    Raises:
-        typer.BadParameter: anything else, or nothing between start and stop.
     """
     if one_of_many := re.fullmatch(r"(\d+)/(\d+)", text.strip()):
         number, count = map(int, one_of_many.groups())

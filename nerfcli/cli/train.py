@@ -112,11 +112,7 @@ class Fit:
     ] = False
 
     def settings(self, training: options.Training) -> "TrainSettings":
-        """Return the settings that the options select.
-
-        Raises:
-            typer.BadParameter: a value cannot be parsed, or does not fit another one.
-        """
+        """Return the settings that the options select."""
         from nerfcli.field.kinds import KINDS
         from nerfcli.training.runs.components import Components, choose
 
@@ -141,11 +137,7 @@ class Fit:
         )
 
     def resources(self, training: options.Training) -> Resources:
-        """Return what the training may use of this machine.
-
-        Raises:
-            typer.BadParameter: the limit of memory cannot be parsed.
-        """
+        """Return what the training may use of this machine."""
         limit = None if self.memory is None else options.bytes_from_text(self.memory)
         return replace(training.resources, memory_bytes=limit)
 

@@ -42,9 +42,6 @@ def load_photos(frames: Sequence[Frame], *, factor: float, threads: int, masks: 
     Args:
         frames: with their images and masks.
         masks: meaning of black in masks: "ignore" (not used), or "empty" (transparent).
-
-    Raises:
-        UserError: a photo cannot be read, or has another size than its camera.
     """
     with ThreadPoolExecutor(max(1, threads)) as pool:
         photos = list(pool.map(lambda frame: load_photo(frame, factor, masks), frames))

@@ -114,9 +114,6 @@ def ffmpeg_program(purpose: str, *, instead: str = "") -> str:
     Args:
         purpose: what fails without it, such as "cannot write videos".
         instead: what else the user can do, for the end of the hint.
-
-    Raises:
-        UserError: ffmpeg is not found, or IMAGEIO_FFMPEG_EXE names no program.
     """
     try:
         program = imageio_ffmpeg.get_ffmpeg_exe()
@@ -128,11 +125,7 @@ def ffmpeg_program(purpose: str, *, instead: str = "") -> str:
 
 
 def open_video(path: Path) -> Video:
-    """Read the header of a video and decode its first frame.
-
-    Raises:
-        UserError: the file does not exist, contains no video, or cannot be decoded.
-    """
+    """Read the header of a video and decode its first frame."""
     if not path.is_file():
         raise UserError(f"{path} does not exist", "give a video file, or a folder of photos")
     suffix = path.suffix.lower()

@@ -57,9 +57,6 @@ def ablate_scene(
 
     Returns:
         The content of ablation.json.
-
-    Raises:
-        UserError: see `nerfcli.training.loop.train`; or no photos are held out, or the folder holds something else.
     """
     scene = load_scene(path)
     refuse_without_held_out_photos(scene)

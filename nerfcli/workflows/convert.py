@@ -112,11 +112,7 @@ def _with_frames(
 
 
 def _report_missing(capture: Capture, reporter: Reporter) -> None:
-    """Name the photos that are not on disk.
-
-    Raises:
-        UserError: none is on disk.
-    """
+    """Name the photos that are not on disk; refuse a capture of which none is."""
     missing = [*(frame.name for frame in capture.frames if not frame.has_photo), *capture.missing]
     count = len(capture.missing) + len(capture.frames)
     if len(missing) == count:
@@ -150,11 +146,7 @@ def detect_convention(
     convention: Convention = Convention(),
     reporter: Reporter = Reporter(),
 ) -> tuple[Format, detect.Detection]:
-    """Detect the format of a capture, and the convention that its numbers follow.
-
-    Raises:
-        UserError: the capture cannot be read, or there is too little evidence.
-    """
+    """Detect the format of a capture, and the convention that its numbers follow."""
     form, found, capture = load(source, given, convention)
     reporter.note(f"{found}: {form.name}, {contents(capture)}")
     for text in capture.notes:

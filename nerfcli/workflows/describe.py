@@ -33,11 +33,7 @@ _CAPTURE_SUFFIXES = (".sfm", ".json", ".xml", ".csv", ".out", ".npz")
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """Return the facts of a capture, a run, renders, a file of data, or else of a scene.
-
-    Raises:
-        UserError: the path is none of these, or damaged.
-    """
+    """Return the facts of a capture, a run, renders, a file of data, or else of a scene."""
     folder = Path(path)
     if not folder.exists():
         raise UserError(f"{folder} does not exist", "give a scene, a run, renders, or one of their files")

@@ -160,11 +160,7 @@ def evaluate_splats(
 
 
 def check_requirements(run: Run, metrics: RunMetrics, requirements: Sequence[Requirement]) -> None:
-    """Raise if a requirement is not met.
-
-    Raises:
-        UserError: a requirement is not met; its exit code is `GATE_NOT_MET`.
-    """
+    """Refuse metrics that do not meet a requirement, with the exit code `GATE_NOT_MET`."""
     if not requirements:
         return
     numbers = known_numbers(metrics, run.config)

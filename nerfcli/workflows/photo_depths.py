@@ -61,11 +61,7 @@ def photo_depths(
 
 
 def depth_errors(run: Run, model: Model, photos: Sequence[DepthMap], *, reporter: Reporter) -> DepthErrors:
-    """Return the errors of the field's depth, read from the run if they were saved for this field.
-
-    Raises:
-        UserError: see `measure_depth_errors`.
-    """
+    """Return the errors of the field's depth, read from the run if they were saved for this field."""
     expected = _digest(model.sha256, [*run.cameras.train, *run.cameras.test])
     errors = _read_depth_errors(run.path, expected=expected)
     if errors is None:

@@ -133,11 +133,7 @@ def _estimated(
 def plan_scene(
     folder: Path, settings: PoseSettings, *, intrinsics: str | Path | None = None, reporter: Reporter = Reporter()
 ) -> Plan:
-    """Plan what `estimate_poses` would do with a folder of photos, and how long it would take.
-
-    Raises:
-        UserError: see `plan_poses`.
-    """
+    """Plan what `estimate_poses` would do with a folder of photos, and how long it would take."""
     prepared = plan_poses(
         folder,
         settings=settings,

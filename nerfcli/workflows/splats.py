@@ -142,9 +142,6 @@ def run_splats(run: Run, model: Model, *, settings: SplatSettings, reporter: Rep
     """Return the splats of a run, made from its field and refined on its training photos, or those that it has.
 
     Splats that the run has are returned as they are if they belong to its field and were made with these settings.
-
-    Raises:
-        UserError: see `export_splats`; or there is nothing to resume.
     """
     kept = _kept(run, model, settings)
     if kept is not None and kept.refinement.seconds >= settings.budget_seconds:

@@ -48,11 +48,7 @@ class PictureOptions:
         return [*size, *lens, *([] if self.crop is None else ["crop", *map(str, self.crop)])]
 
     def of(self, camera: Camera) -> Camera:
-        """Return a camera with this size, lens and crop.
-
-        Raises:
-            UserError: the crop is outside the picture, or the lens cannot have this size or field of view.
-        """
+        """Return a camera with this size, lens and crop."""
         if self.lens == "equirectangular" and self.fov_deg is None and (self.width or self.height):
             width = self.width or 2 * (self.height or 0)
             camera = equirectangular(width, self.height or width // 2)
@@ -95,9 +91,6 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
 
     Args:
         depth_hint: distance to the scene's centre, for paths around it if the optical axes do not determine it.
-
-    Raises:
-        UserError: there are no such cameras, or an option cannot be used with them.
     """
     cameras, through = views.cameras, views.through
     if through is not None and cameras not in PATHS:
@@ -123,11 +116,7 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
 
 
 def frames_of_file(views: Views) -> list[Frame]:
-    """Return the frames of a file or folder of cameras.
-
-    Raises:
-        UserError: there are no cameras, or an option cannot be used with them.
-    """
+    """Return the frames of a file or folder of cameras."""
     return _presented(_frames_of(Path(views.cameras)), views)
 
 

@@ -92,9 +92,6 @@ def write_camera_path(capture: Capture, path: Path, *, fps: float = DEFAULT_FPS)
     """Write the capture's views as a camera path, atomically; each one is a keyframe too, so that the viewer shows it.
 
     The file has one type of lens and one picture size: those of most views. See `losses_camera_path`.
-
-    Raises:
-        UserError: there is no view, or the file cannot be written.
     """
     if not capture.frames:
         raise UserError(f"there are no views to write to {path}", "a camera path needs at least one view")

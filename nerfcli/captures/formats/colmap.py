@@ -49,9 +49,6 @@ def parse_colmap(model_dir: Path) -> Capture:
 
     Args:
         model_dir: holds cameras, images and points3D, as .bin (which wins) or .txt; points3D may be missing.
-
-    Raises:
-        UserError: a file is missing, truncated or inconsistent; the file is named.
     """
     model = read_model(model_dir)
     try:
@@ -113,9 +110,6 @@ def read_cameras(path: Path) -> tuple[dict[int, Camera], dict[str, int]]:
     """Read the cameras of a cameras.bin or cameras.txt by id, and the camera ids by image name.
 
     Image names are known only if the model's images file is beside it.
-
-    Raises:
-        UserError: a file is not readable, truncated or inconsistent; the file is named.
     """
     encoding = _ENCODINGS[path.suffix]
     cameras = _parse(path, encoding.cameras_from_bytes)

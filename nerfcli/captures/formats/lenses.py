@@ -41,9 +41,6 @@ def brown_camera(
         u = fx (x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)) + cx
         v = fy (y (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p2 x y + p1 (r^2 + 2 y^2)) + cy
 
-    Raises:
-        UserError: invalid parameters of a camera; `where` is named.
-
     Source: docs.opencv.org, "Camera Calibration and 3D Reconstruction".
     """
     k1, k2, k3 = radial
@@ -75,9 +72,6 @@ def fisheye_camera(
     With R = sqrt(X^2 + Y^2), t = atan2(R, Z), x = t X/R, y = t Y/R, r^2 = x^2 + y^2:
         u = fx (x (1 + k1 r^2 + ... + k4 r^8) + 2 p1 x y + p2 (r^2 + 2 x^2) + sx r^2) + cx
         v = fy (y (1 + k1 r^2 + ... + k4 r^8) + 2 p2 x y + p1 (r^2 + 2 y^2) + sy r^2) + cy
-
-    Raises:
-        UserError: invalid parameters of a camera; `where` is named.
 
     Source: docs.opencv.org, "Fisheye camera model"; COLMAP src/colmap/sensor/models.h, ThinPrismFisheyeCameraModel.
     """
@@ -173,11 +167,7 @@ class Fits:
         return self._accepted(_best(plain, start, terms), terms.beyond_fisheye, where)
 
     def matrix(self, matrix: np.ndarray, size: Size, where: str) -> Camera:
-        """Return the perspective camera of a matrix (3, 3) of intrinsics: fx, s, cx; 0, fy, cy; 0, 0, 1.
-
-        Raises:
-            UserError: the matrix is not of this form, a number is invalid, or see `brown`; `where` is named.
-        """
+        """Return the perspective camera of a matrix (3, 3) of intrinsics: fx, s, cx; 0, fy, cy; 0, 0, 1."""
         focal, centre, skew = parts_of_matrix(matrix, size, where)
         return self.brown(size, focal, centre, terms=Terms(skew=skew), where=where)
 

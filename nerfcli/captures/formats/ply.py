@@ -20,9 +20,6 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     Returns:
         points (N, 3) float64; colours (N, 3) uint8, or None where vertices have none. Colours that are stored as floats
         are taken to be in [0, 1].
-
-    Raises:
-        UserError: the file is missing, damaged, or has no vertices with x, y and z.
     """
     table = read_ply_vertices(path)
     names = table.dtype.names or ()

@@ -136,11 +136,7 @@ def photo_folder(path: Path) -> Path | None:
 
 
 def format_named(name: str) -> Format:
-    """Return the format with this name.
-
-    Raises:
-        UserError: there is none.
-    """
+    """Return the format with this name."""
     named = {form.name: form for form in FORMATS}
     if name not in named:
         raise UserError(f"unknown format {name!r}", f"choose one of {', '.join(named)}", exit_code=2)
@@ -172,9 +168,6 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
     """Return the capture with masks from a folder, by the names of the photos, the ends of these, or those on disk.
 
     Photos without a mask there keep the one that they have.
-
-    Raises:
-        UserError: there is no such folder, it has no mask for any photo, or it contains the photos.
     """
     refuse_missing_masks(folder)
     found = [

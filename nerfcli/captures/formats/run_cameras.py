@@ -58,11 +58,7 @@ def write_cameras(
 
 
 def read_cameras(run: Path) -> RunCameras:
-    """Return the frames of a run.
-
-    Raises:
-        UserError: the folder is not one that `train` wrote, or the file is damaged.
-    """
+    """Return the frames of a run."""
     return _read_frames(run / CAMERAS, given=False)
 
 

@@ -57,9 +57,6 @@ def save(
         depths: depth maps of a sensor by the name of the photo.
         split: "train", "test", "val" or None (unused) by the name of the photo; by default every 8th is held out.
         depth_bounds: nearest and farthest z by name, in scene units, if they are known without points.
-
-    Raises:
-        UserError: the model cannot be read, or scene.json cannot be written.
     """
     model = read_model(scene_dir / MODEL_FOLDER)
     points = model.points
