@@ -69,9 +69,6 @@ def align_robustly(x: np.ndarray, y: np.ndarray) -> Alignment:
 
     It starts from the best of 200 alignments of three points each, by median residual (Rousseeuw 1984), so up to half
     of the points may be wrong. Below 5 points, outliers cannot be found, and all points count. Deterministic.
-
-    Args:
-        x, y: (N, 3), N >= 2.
     """
     count = len(x)
     everywhere = np.ones(count, dtype=bool)

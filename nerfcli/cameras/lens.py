@@ -130,12 +130,7 @@ class Lens:
 
 
 def lens_of(model: str, values: dict[str, float]) -> Lens:
-    """Return the lens of one of COLMAP's models.
-
-    Args:
-        model: one of `DISTORTIONS`.
-        values: the parameters by COLMAP's names, in COLMAP's order.
-    """
+    """Return the lens of one of COLMAP's models."""
     groups = DISTORTIONS[model]
     distortions = tuple(
         Distortion(**{term: tuple(values[name] for name in names) for term, names in group.items()}) for group in groups

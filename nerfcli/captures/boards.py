@@ -297,12 +297,7 @@ def scale_from_markers(frames: Sequence[Frame], side: float, *, dictionary: str)
 
 
 def scale_from_charuco(frames: Sequence[Frame], board: CharucoBoard) -> ScaleEstimate:
-    """Estimate metres per unit from all neighbouring inner corners of a ChArUco board; see `scale_from_corners`.
-
-    Args:
-        frames: with cameras that fit the photos on disk, see `orientation.upright`.
-        board: as it was printed.
-    """
+    """Estimate metres per unit from all neighbouring inner corners of a ChArUco board; see `scale_from_corners`."""
     dictionary = _dictionary(board.dictionary)
     if board.columns * board.rows // 2 > len(dictionary.bytesList):
         raise UserError(

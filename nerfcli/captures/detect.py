@@ -206,10 +206,8 @@ def _interval(
 ) -> tuple[float, float]:
     """Return the 99 % interval of the statistic of `second` minus that of `best`, under resampling of photos.
 
-    With few photos, the items themselves are resampled.
-
-    Args:
-        statistic: of errors in ascending order, given how often each was drawn.
+    With few photos, the items themselves are resampled. The statistic is of errors in ascending order, given how often
+    each was drawn.
     """
     rng = np.random.default_rng(0)
     names, members = np.unique(groups, return_inverse=True)

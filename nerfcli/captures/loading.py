@@ -80,10 +80,6 @@ def fingerprint(scene: Capture) -> str:
 def with_photos_on_disk(path: Path, form: Format, found: Path, capture: Capture) -> Capture:
     """Return a capture with the photos that are on disk, upright, and the split of its files if they have one.
 
-    Args:
-        path: the file or folder that was given.
-        form, found: what `captures.formats.registry.recognise` returns for it.
-
     Raises:
         UserError: no photo is on disk, or one does not fit its camera.
     """

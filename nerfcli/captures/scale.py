@@ -184,9 +184,6 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
     standard error is the larger of the jackknife's, over up to 20 groups of neighbouring photos, and
     sigma / sqrt(sum |x - mean|^2), where sigma is the GPS noise per coordinate, at least 3 m with fewer than 6 photos.
 
-    Args:
-        frames: the cameras; those without a position are not used.
-
     Raises:
         UserError: fewer than two positions, all cameras or positions at one place, or a spread of the photos below 3
             times the GPS noise; the error gives the numbers.

@@ -47,12 +47,7 @@ def transformed(capture: Capture, new_from_world: Similarity) -> Capture:
 
 
 def up_aligned(frames: Sequence[Frame], axis: str) -> Similarity:
-    """Return the smallest rotation about the origin that turns the up direction onto an axis of the new frame.
-
-    Args:
-        frames: give the up direction through `up_direction`.
-        axis: x, y, z, -x, -y or -z.
-    """
+    """Return the smallest rotation about the origin that turns the up direction onto an axis of the new frame."""
     if axis not in WORLD_AXES:
         raise UserError(
             f"unknown axis {axis!r} for the up direction", f"choose one of {', '.join(WORLD_AXES)}", exit_code=2
@@ -117,11 +112,7 @@ class WorldFrame:
 
 @dataclass(frozen=True)
 class Moved:
-    """A capture in another world frame.
-
-    Args:
-        scale: the estimate of the scale if lengths became metres.
-    """
+    """A capture in another world frame."""
 
     capture: Capture
     new_from_old: Similarity

@@ -70,11 +70,6 @@ def for_each_input(source: str, work: Callable[[Given], None], *, command: str) 
 
     A path that fails is reported and the remaining ones are processed; the exit code is that of the first failure.
 
-    Args:
-        source: a path, or "-".
-        work: runs the whole command on one input.
-        command: name of the command, for the hint.
-
     Raises:
         UserError: the only input failed, or standard input held no path.
     """

@@ -30,11 +30,7 @@ _WIDTHS = re.compile(rb"GPano:(?:FullPanoWidthPixels|CroppedAreaImageWidthPixels
 
 
 def is_panorama(path: Path, picture: NDArray[np.uint8]) -> bool:
-    """Return whether a photo shows the whole sphere: its metadata says so, or its edges and poles show it.
-
-    Args:
-        picture: (H, W, C) its upright pixels.
-    """
+    """Return whether a photo, whose upright pixels are (H, W, C), shows the whole sphere: by its metadata or edges."""
     height, width = picture.shape[:2]
     return width == 2 * height and (_states_sphere(path) or _shows_sphere(picture))
 

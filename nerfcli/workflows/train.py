@@ -280,9 +280,6 @@ def plan_training(
         >>> from nerfcli.workflows.train import plan_training
         >>> plan_training("photos-scene", TrainSettings(budget_seconds=300)).memory_bytes
 
-    Args:
-        scene, settings, holdout, resources: as for `train_scene`.
-
     Raises:
         UserError: the scene cannot be read, has no training photo, or does not fit into memory.
     """

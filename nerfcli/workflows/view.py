@@ -77,11 +77,7 @@ def _from_elsewhere(host: str, port: int) -> str:
 
 
 class RunData:
-    """Data of a run for the server, see `viewer.server.PageData`.
-
-    Args:
-        resources: threads for pictures.
-    """
+    """Data of a run for the server, see `viewer.server.PageData`."""
 
     def __init__(self, path: Path, resources: Resources):
         self._path = path

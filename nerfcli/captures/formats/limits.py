@@ -188,10 +188,6 @@ class FramePoses:
 def left_out(lost: Sequence[tuple[str, UserError]], count: int) -> tuple[str, ...]:
     """Return a line that names the frames that were left out, for people; none if there are none.
 
-    Args:
-        lost: their names, and why.
-        count: the number of frames with them.
-
     Raises:
         UserError: fewer than two of the frames remain, or less than half.
     """

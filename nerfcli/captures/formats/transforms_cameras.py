@@ -142,11 +142,7 @@ def merged(content: dict[str, Any], record: dict[str, Any]) -> dict[str, Any]:
 
 
 def contradictions(listed: Sequence[tuple[dict[str, Any], Camera]]) -> tuple[str, ...]:
-    """Return a line for each axis on which two keys give different focal lengths, for people.
-
-    Args:
-        listed: the frames' keys, see `merged`, and their cameras.
-    """
+    """Return a line for each axis on which two keys give different focal lengths, for people."""
     notes = []
     for side, (key, other) in enumerate(_SAME):
         off = []

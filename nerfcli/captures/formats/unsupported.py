@@ -35,11 +35,7 @@ def lost_parts(capture: Capture, *, holds: Collection[str]) -> list[str]:
 
 
 def lost_of_cameras(capture: Capture, lost: Callable[[Camera], Iterable[str]]) -> list[str]:
-    """List the losses of cameras as clauses "k3 of 2 cameras", with the number of distinct cameras affected.
-
-    Args:
-        lost: returns the properties of a camera that the format cannot hold.
-    """
+    """List the losses of cameras as clauses "k3 of 2 cameras", with the number of distinct cameras affected."""
     cameras = {frame.camera for frame in capture.frames}
     counts = Counter(name for camera in cameras for name in lost(camera))
     return [f"{name} of {several(count, 'camera')}" for name, count in sorted(counts.items())]
