@@ -26,11 +26,12 @@ from nerfcli.captures.formats.fields import (
     check_unique_names,
     malformed,
     name_of,
-    numbers,
+    number,
     read_json_object,
     record_of,
     shown,
     size_of,
+    vector,
 )
 from nerfcli.captures.formats.format import Format, UserInputs, by_suffix, has_keys
 from nerfcli.captures.formats.limits import FramePoses, without
@@ -53,7 +54,7 @@ def parse_alicevision(path: Path, given: UserInputs = UserInputs()) -> Capture:
     content = read_json_object(path)
     if not all(isinstance(content.get(key), list) for key in _LISTS):
         raise malformed(path, "has no version, views, intrinsics or poses", _EXPECTED)
-    version = tuple(int(number) for number in _numbers(content["version"], 3, f"{path}: version"))
+    version = tuple(vector(content, "version", 3, str(path)).astype(int).tolist())
     cameras = {
         key: _camera(record, place, version)
         for key, record, place in _identified(content["intrinsics"], "intrinsicId", f"{path}: intrinsics")
@@ -108,35 +109,24 @@ def _common_folder(paths: list[str]) -> str:
     return f"{folder}/" if folder else ""
 
 
-def _numbers(value: Any, count: int, where: str) -> list[float]:
-    """Return a list of `count` numbers, which the file holds as texts, or, once edited by a script, as numbers."""
-    if not isinstance(value, list) or not all(isinstance(item, str | int | float) for item in value):
-        raise malformed(where, f"is {shown(value)}", f"expected a list of {count} numbers, as texts")
-    return numbers(list(map(str, value)), count, where)
-
-
-def _number(record: dict[str, Any], key: str, where: str, *, default: str | None = None) -> float:
-    return _numbers([record.get(key, default)], 1, f"{where}: {key}")[0]
-
-
 def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
     """Return the first three rows of world_from_cam, (3, 4)."""
     transform = record_of(record_of(record.get("pose"), f"{where}: pose").get("transform"), f"{where}: transform")
-    rotation = np.array(_numbers(transform.get("rotation"), 9, f"{where}: rotation")).reshape(3, 3)
-    centre = np.array(_numbers(transform.get("center"), 3, f"{where}: center"))
-    return np.column_stack([rotation, centre])
+    rotation = vector(transform, "rotation", 9, where).reshape(3, 3)
+    return np.column_stack([rotation, vector(transform, "center", 3, where)])
 
 
 def _camera(record: dict[str, Any], where: str, version: tuple[int, ...]) -> Camera:
-    size = size_of(_number(record, "width", where), _number(record, "height", where), where)
+    size = size_of(number(record, "width", where), number(record, "height", where), where)
     focal = _focal_lengths(record, size[0], version, where)
-    x, y = _numbers(record.get("principalPoint"), 2, f"{where}: principalPoint")
+    x, y = vector(record, "principalPoint", 2, where).tolist()
     centre = (x, y) if version < (1, 2, 1) else (size[0] / 2 + x, size[1] / 2 + y)
     kind = str(record.get("type", "")).lower()
     if kind == "pinhole":
         kind = str(record.get("distortionType", kind)).lower()
     terms = record.get("distortionParams") or []  # an empty list is written as an empty text
-    values = [*_numbers(terms, len(terms) if isinstance(terms, list) else 0, f"{where}: distortionParams"), *(0.0,) * 5]
+    count = len(terms) if isinstance(terms, list) else 1
+    values = [*vector({"distortionParams": terms}, "distortionParams", count, where).tolist(), *(0.0,) * 5]
     if kind in _FISHEYE:
         return lenses.fisheye_camera(size, focal, centre, radial=values[:4], where=where)
     if kind not in _RADIAL:
@@ -149,15 +139,15 @@ def _camera(record: dict[str, Any], where: str, version: tuple[int, ...]) -> Cam
 def _focal_lengths(record: dict[str, Any], width: int, version: tuple[int, ...], where: str) -> tuple[float, float]:
     """Return fx and fy in pixels."""
     if version < (1, 2, 0):
-        focal = _number(record, "pxFocalLength", where)
+        focal = number(record, "pxFocalLength", where)
         return focal, focal
     if version < (1, 2, 2):
-        fx, fy = _numbers(record.get("pxFocalLength"), 2, f"{where}: pxFocalLength")
+        fx, fy = vector(record, "pxFocalLength", 2, where).tolist()
         return fx, fy
-    sensor, ratio = _number(record, "sensorWidth", where), _number(record, "pixelRatio", where, default="1")
+    sensor, ratio = number(record, "sensorWidth", where), number(record, "pixelRatio", where, default=1.0)
     if sensor <= 0 or ratio <= 0:
         raise malformed(where, f"sensorWidth is {sensor:g} and pixelRatio {ratio:g}", "expected numbers above 0")
-    fx = _number(record, "focalLength", where) * width / sensor
+    fx = number(record, "focalLength", where) * width / sensor
     return fx, fx * ratio if version >= (1, 2, 5) else fx / ratio
 
 
@@ -168,8 +158,9 @@ def _points(value: Any, where: str) -> tuple[np.ndarray, np.ndarray | None]:
     if not value:
         return np.zeros((0, 3)), None
     records = [record_of(item, f"{where}[{index}]") for index, item in enumerate(value)]
-    points = [_numbers(record.get("X"), 3, f"{where}[{index}]: X") for index, record in enumerate(records)]
-    colours = [_numbers(record.get("color"), 3, f"{where}[{index}]: color") for index, record in enumerate(records)]
+    points, colours = (
+        [vector(record, key, 3, f"{where}[{index}]") for index, record in enumerate(records)] for key in ("X", "color")
+    )
     return np.array(points), np.clip(np.rint(colours), 0, 255).astype(np.uint8)
 
 
