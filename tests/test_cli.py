@@ -795,9 +795,7 @@ def test_run_holds_out_what_is_asked_of_a_capture_and_refuses_options_of_poses(m
     # Regression: what is usual without poses was ignored, and from Python what `poses` says.
     assert rules == [None, "block:0.15", "every:8", "block:0.15", "every:8", None]
     for more in (("--frames", "9"), ("--quality", "best"), ("--subfolders",)):
-        refused = nerfcli("run", capture, *more)
-        assert refused.exit_code == 2
-        assert "has poses, which are used" in error_of(refused)[0]
+        assert "has poses, which are used" in refusal("run", capture, *more, exit_code=2)[0]
 
 
 def test_run_holds_out_what_is_asked_of_photos(monkeypatch, capture):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from captures import photograph, reprojection_px, with_photos
-from commands import error_of, listing, nerfcli
+from commands import completed, error_of, listing, nerfcli, refusal
 from views import BROWN, FISHEYE, PANORAMA, PINHOLE, PRISM, RADIAL, RATIONAL, SQUARE, capture_of
 
 from nerfcli.cameras import rigid
@@ -117,8 +117,7 @@ CAMERAS = {
 @pytest.mark.parametrize("program", ["nerfstudio", "instant-ngp"])
 def test_programs_that_read_transforms_name_it(program, tmp_path):
     source = model_of(tmp_path, capture_of([PINHOLE]))
-    named = nerfcli("convert", source, tmp_path / "program.json", "--to", program, "--json")
-    assert named.exit_code == 0, named.stderr
+    named = completed("convert", source, tmp_path / "program.json", "--to", program, "--json")
     assert json.loads(named.stdout)["to"] == "transforms"
     nerfcli("convert", source, tmp_path / "form.json", "--to", "transforms")
     cameras = [json.loads((tmp_path / name).read_text())["frames"] for name in ("program.json", "form.json")]
@@ -132,8 +131,7 @@ def test_colmap_to_a_format_and_back_moves_no_pixel(form, tmp_path):
     capture = with_photos(capture, tmp_path / "images")
     photograph(capture.frames)
     source = model_of(tmp_path, capture)
-    there = nerfcli("convert", source, tmp_path / "there", "--to", form, "--allow-loss", "--json")
-    assert there.exit_code == 0, there.stderr
+    there = completed("convert", source, tmp_path / "there", "--to", form, "--allow-loss", "--json")
     report = json.loads(there.stdout)
     assert report["read_back"]["max_px"] < LIMIT_PX
     assert report["read_back"]["rays"] > 100
@@ -143,8 +141,7 @@ def test_colmap_to_a_format_and_back_moves_no_pixel(form, tmp_path):
         (tmp_path / "camera.json").write_text(json.dumps(one))
         more = ["--intrinsics", tmp_path / "camera.json"]
         capture = replace(capture, frames=tuple(replace(frame, camera=PINHOLE) for frame in capture.frames))
-    back = nerfcli("convert", report["path"], tmp_path / "back", "--to", "colmap", "--allow-loss", *more)
-    assert back.exit_code == 0, back.stderr
+    completed("convert", report["path"], tmp_path / "back", "--to", "colmap", "--allow-loss", *more)
     _, _, again = load(tmp_path / "back", UserInputs(), Convention())
     assert reprojection_px(capture, again) < LIMIT_PX
 
@@ -154,8 +151,7 @@ def test_axes_and_pixel_centre_of_the_written_file(tmp_path):
     source, out = model_of(tmp_path, capture_of([PINHOLE])), tmp_path / "out.json"
     capture = load(source, UserInputs(), Convention())[2]
     options = ("--axes", "opencv", "--pixel-center", "0", "--allow-loss")
-    result = nerfcli("convert", source, out, "--to", "transforms", *options)
-    assert result.exit_code == 0, result.stderr
+    completed("convert", source, out, "--to", "transforms", *options)
     content = json.loads(out.read_text())
     matrix = content["frames"][0]["transform_matrix"]
     np.testing.assert_allclose(matrix, capture.frames[0].world_from_cam, rtol=0, atol=1e-15)
@@ -174,9 +170,7 @@ def test_axes_and_pixel_centre_of_the_written_file(tmp_path):
 )
 def test_a_convention_that_the_format_fixes_is_refused(form, options, message, tmp_path):
     source = model_of(tmp_path, replace(capture_of([PINHOLE]), observations=None))
-    result = nerfcli("convert", source, tmp_path / "out", "--to", form, *options)
-    assert result.exit_code == BAD_INPUT
-    assert message in error_of(result)[0]
+    assert message in refusal("convert", source, tmp_path / "out", "--to", form, *options)[0]
     assert not (tmp_path / "out").exists()
 
 
@@ -185,16 +179,14 @@ def test_intrinsics_for_a_format_that_has_its_own_are_refused(tmp_path):
     source = model_of(tmp_path, capture_of([PINHOLE]))
     (tmp_path / "camera.json").write_text(json.dumps(SQUARE.to_json()))
     options = ("--to", "transforms", "--intrinsics", tmp_path / "camera.json")
-    result = nerfcli("convert", source, tmp_path / "out.json", *options)
-    assert result.exit_code == USAGE
-    assert "colmap captures have their own cameras" in error_of(result)[0]
-    assert "tum, kitti" in error_of(result)[1]
+    error, hint = refusal("convert", source, tmp_path / "out.json", *options, exit_code=USAGE)
+    assert "colmap captures have their own cameras" in error
+    assert "tum, kitti" in hint
     assert not (tmp_path / "out.json").exists()
     (tmp_path / "blender").mkdir()
     (tmp_path / "blender/transforms_train.json").write_text("{}")
-    result = nerfcli("convert", tmp_path / "blender", tmp_path / "out.json", *options)
-    assert result.exit_code == USAGE
-    assert "blender captures have their own cameras" in error_of(result)[0]
+    error, _ = refusal("convert", tmp_path / "blender", tmp_path / "out.json", *options, exit_code=USAGE)
+    assert "blender captures have their own cameras" in error
 
 
 def test_a_file_that_holds_the_inverse_is_read_so(tmp_path):
@@ -206,8 +198,7 @@ def test_a_file_that_holds_the_inverse_is_read_so(tmp_path):
         content["frames"].append({"file_path": frame.name, "transform_matrix": matrix})
     (tmp_path / "wrong.json").write_text(json.dumps(content))
     options = ("--from-axes", "opencv", "--from-inverted")
-    result = nerfcli("convert", tmp_path / "wrong.json", tmp_path / "out", "--to", "colmap", *options)
-    assert result.exit_code == 0, result.stderr
+    completed("convert", tmp_path / "wrong.json", tmp_path / "out", "--to", "colmap", *options)
     assert reprojection_px(capture, load(tmp_path / "out", UserInputs(), Convention())[2]) < LIMIT_PX
 
 
@@ -215,8 +206,7 @@ def test_intrinsics_for_another_size(tmp_path):
     """Intrinsics for twice the resolution, principal point off the middle, in a file with the size of the photos."""
     double = Camera("PINHOLE", 640, 480, (1000.0, 1010.0, 642.5, 477.0))
     source = model_of(tmp_path, capture_of([double]))
-    result = nerfcli("convert", source, tmp_path / "out", "--to", "colmap", "--from-size", "2")
-    assert result.exit_code == 0
+    result = completed("convert", source, tmp_path / "out", "--to", "colmap", "--from-size", "2")
     assert "principal point" not in result.stderr
     assert load(tmp_path / "out", UserInputs(), Convention())[2].frames[0].camera == PINHOLE
     warned = nerfcli("convert", source, tmp_path / "as-it-is", "--to", "colmap").stderr
@@ -232,8 +222,7 @@ def test_the_world_frame_and_its_scale(tmp_path):
     out = tmp_path / "out"
     distance = f"{','.join(map(str, first.centre))} {','.join(map(str, second.centre))} {metres}"
     options = ("--origin", "centre-of-cameras", "--world-up", "-y", "--distance", distance, "--json")
-    result = nerfcli("convert", model_of(tmp_path, capture), out, "--to", "nerfcli", *options)
-    assert result.exit_code == 0, result.stderr
+    result = completed("convert", model_of(tmp_path, capture), out, "--to", "nerfcli", *options)
     again = load(out, UserInputs(), Convention())[2]
     centres = np.array([frame.centre for frame in again.frames])
     np.testing.assert_allclose(centres.mean(axis=0), 0, atol=1e-12)
@@ -277,8 +266,7 @@ def test_losses_are_refused_and_named_then_accepted(form, camera, lost, tmp_path
     assert "--allow-loss" in error_of(result)[1]
     assert result.stdout == ""
     assert listing(tmp_path) == before
-    accepted = nerfcli("convert", source, tmp_path / "out", "--to", form, "--allow-loss", "--json")
-    assert accepted.exit_code == 0, accepted.stderr
+    accepted = completed("convert", source, tmp_path / "out", "--to", form, "--allow-loss", "--json")
     assert f"{form} cannot hold {lost}" in accepted.stderr
     report = json.loads(accepted.stdout)
     assert any(lost in clause for clause in report["losses"])
@@ -289,16 +277,14 @@ def test_features_are_left_out_with_a_warning(tmp_path):
     capture = capture_of([PINHOLE])
     seen = Observations(np.zeros(3, np.int64), np.arange(3), np.ones((3, 2)))
     source = model_of(tmp_path, replace(capture, observations=seen))
-    result = nerfcli("convert", source, tmp_path / "out.json", "--to", "transforms")
-    assert result.exit_code == 0
+    result = completed("convert", source, tmp_path / "out.json", "--to", "transforms")
     assert "Warning: transforms cannot hold 3 observations" in result.stderr
 
 
 def test_the_effect_of_a_lost_term_is_reported_in_pixels(tmp_path):
     """The loss of the distortion moves pixels by at most f k r^3 at the corner of the picture."""
     source = model_of(tmp_path, capture_of([RADIAL]))
-    result = nerfcli("convert", source, tmp_path / "out", "--to", "llff", "--allow-loss", "--json")
-    assert result.exit_code == 0, result.stderr
+    result = completed("convert", source, tmp_path / "out", "--to", "llff", "--allow-loss", "--json")
     (corner,), _ = RADIAL.bearings(np.zeros((1, 2)))
     most = 500 * 0.05 * np.hypot(corner[0] / corner[2], corner[1] / corner[2]) ** 3
     assert 0.3 * most < json.loads(result.stdout)["loss_px"] < most
@@ -356,8 +342,7 @@ def test_coordinates_of_the_globe_are_compared_as_finely_as_float64_can(tmp_path
 
 def test_points_alone(tmp_path):
     source = model_of(tmp_path, capture_of([PINHOLE]))
-    result = nerfcli("convert", source, tmp_path / "points.ply", "--to", "ply", "--allow-loss")
-    assert result.exit_code == 0, result.stderr
+    result = completed("convert", source, tmp_path / "points.ply", "--to", "ply", "--allow-loss")
     assert "6 cameras and their poses" in result.stderr
     assert result.stderr.endswith("points.ply: read back\n")
     capture = capture_of([PINHOLE])
@@ -395,9 +380,7 @@ def test_what_is_in_the_way_is_kept(out, form, more, message, tmp_path):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_bytes(b"photo")
     before = listing(tmp_path)
-    result = nerfcli("convert", source, tmp_path / out, "--to", form, "--allow-loss", *more)
-    assert result.exit_code == BAD_INPUT
-    assert message in error_of(result)[0]
+    assert message in refusal("convert", source, tmp_path / out, "--to", form, "--allow-loss", *more)[0]
     assert listing(tmp_path) == before
 
 
@@ -434,8 +417,7 @@ def test_photos_of_a_model_are_found_whatever_its_names_are_relative_to(prefix, 
     photograph(with_photos(capture, tmp_path / "images").frames)
     capture = replace(capture, frames=tuple(replace(f, name=prefix + f.name) for f in capture.frames))
     convert(capture, tmp_path / "sparse" / "0", TargetOptions(format_named("colmap")))
-    result = nerfcli("convert", tmp_path, tmp_path / "elsewhere" / "transforms.json", "--to", "transforms")
-    assert result.exit_code == 0, result.stderr
+    completed("convert", tmp_path, tmp_path / "elsewhere" / "transforms.json", "--to", "transforms")
     content = json.loads((tmp_path / "elsewhere" / "transforms.json").read_text())
     assert content["frames"][0]["file_path"] == "../images/photo 00.png"
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from commands import error_of, nerfcli
+from commands import completed, nerfcli, refusal
 from PIL import Image
 from views import BROWN, PINHOLE, capture_of
 
@@ -23,7 +23,7 @@ from nerfcli.captures.detect import Detection, HypothesisScore, Question, detect
 from nerfcli.captures.evidence import LEAST_MOVE, MatchEvidence, match_neighbours
 from nerfcli.captures.formats.colmap import write_colmap_text
 from nerfcli.captures.formats.transforms import write_transforms
-from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.errors import UserError
 from nerfcli.matching.features import Features, Matches, find_features
 
 
@@ -336,13 +336,11 @@ def test_photos_identify_the_convention_and_how_to_read_it(meant, photographed, 
     assert report["as_format_says"] == (meant == Convention("opengl"))
     if meant.inverted:
         assert report["options"] == "--from-axes opencv --from-inverted"
-        result = nerfcli("convert", tmp_path, "--detect")
-        assert result.exit_code == 0, result.stderr
+        result = completed("convert", tmp_path, "--detect")
         assert "SIFT matches" in result.stdout
         assert "fits" in result.stdout
         assert report["options"] in result.stdout
-        mended = nerfcli("convert", tmp_path, tmp_path / "out", "--to", "colmap", *report["options"].split())
-        assert mended.exit_code == 0, mended.stderr
+        completed("convert", tmp_path, tmp_path / "out", "--to", "colmap", *report["options"].split())
     assert not (tmp_path / "cache").exists()
 
 
@@ -355,10 +353,9 @@ def test_sharp_photos_reveal_a_half_pixel(photographed):
 def test_nothing_to_judge_by(tmp_path):
     capture = replace(capture_of([PINHOLE]), points=np.zeros((0, 3)), colours=None, observations=None)
     write_colmap_text(capture, tmp_path / "in")
-    result = nerfcli("convert", tmp_path / "in", "--detect")
-    assert result.exit_code == BAD_INPUT
-    assert "the convention cannot be detected" in error_of(result)[0]
-    assert "--images" in error_of(result)[1]
+    error, hint = refusal("convert", tmp_path / "in", "--detect")
+    assert "the convention cannot be detected" in error
+    assert "--images" in hint
 
 
 def test_a_photo_of_another_shape_is_reported(photographed):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from captures import reprojection_px
-from commands import error_of, listing, nerfcli
+from commands import completed, error_of, listing, nerfcli, refusal
 from PIL import Image
 from test_convert import LIMIT_PX, model_of
 from test_scale import photos_of, sheet_of_markers
@@ -97,8 +97,7 @@ def test_a_known_distance_reaches_training_as_metres(tmp_path):
     source = model_of(tmp_path, capture)
     distance = f'"{first.name}" "{second.name}" 2.5'
     before = listing(tmp_path)
-    result = nerfcli("convert", source, tmp_path / "my scene", "--to", "nerfcli", "--distance", distance, "--json")
-    assert result.exit_code == 0, result.stderr
+    completed("convert", source, tmp_path / "my scene", "--to", "nerfcli", "--distance", distance, "--json")
     assert {name: data for name, data in listing(tmp_path).items() if "my scene" not in name} == before
     scene = load_scene(tmp_path / "my scene")
     assert (scene.kind, scene.unit, scene.unit_source) == ("nerfcli", "metre", "1 known distance")
@@ -126,8 +125,7 @@ def test_a_folder_of_masks_reaches_training(tmp_path):
             place.parent.mkdir(parents=True, exist_ok=True)
             Image.new("L", (frame.camera.width, frame.camera.height), 255).save(place)
     options = ("--to", "nerfcli", "--masks", masks)
-    result = nerfcli("convert", tmp_path / "project", tmp_path / "scene", *options)
-    assert result.exit_code == 0, result.stderr
+    result = completed("convert", tmp_path / "project", tmp_path / "scene", *options)
     count = len(capture.frames)
     assert f"{count - 1} masks" in result.stderr
     frames = load_scene(tmp_path / "scene").frames
@@ -173,8 +171,7 @@ def test_cameras_of_a_scene_are_for_upright_photos(camera, tmp_path):
     orientations = {0: 6, 1: 3, 2: 8}
     capture = photographed(capture_of([camera], num_points=12), tmp_path / "images", orientations)
     write_colmap_binary(capture, tmp_path / "sparse/0")
-    result = nerfcli("convert", tmp_path, tmp_path / "scene", "--to", "nerfcli")
-    assert result.exit_code == 0, result.stderr
+    result = completed("convert", tmp_path, tmp_path / "scene", "--to", "nerfcli")
     assert "3 photos have an EXIF orientation: the cameras refer to pixels upright" in result.stderr
     scene = load_scene(tmp_path / "scene")
     _, _, parsed = load(tmp_path / "scene", UserInputs(), Convention())
@@ -207,8 +204,7 @@ def test_other_programs_get_cameras_for_the_pixels_as_they_are_stored(form, plac
     upright = in_pixels(capture, "upright").capture
     write_scene(upright, tmp_path / "scene")
     options = ("--pixels", "stored", "--allow-loss")
-    result = nerfcli("convert", tmp_path / "scene", tmp_path / place, "--to", form, *options)
-    assert result.exit_code == 0, result.stderr
+    result = completed("convert", tmp_path / "scene", tmp_path / place, "--to", form, *options)
     assert "3 photos have an EXIF orientation: the cameras refer to pixels as stored" in result.stderr
     assert reprojection_px(capture, load(tmp_path / place, UserInputs(), Convention())[2]) < LIMIT_PX
     if form in ("colmap", "colmap-text", "transforms"):
@@ -244,8 +240,7 @@ def test_markers_are_sought_in_photos_as_the_scene_shows_them(tmp_path):
     capture = Capture(tuple(frames), np.zeros((0, 3)), (), None, "made", pixels="upright")
     write_scene(capture, tmp_path / "scene")
     options = ("--to", "nerfcli", "--markers", "DICT_4X4_50:0.05", "--json")
-    result = nerfcli("convert", tmp_path / "scene", tmp_path / "out", *options)
-    assert result.exit_code == 0, result.stderr
+    result = completed("convert", tmp_path / "scene", tmp_path / "out", *options)
     assert "from ArUco markers (DICT_4X4_50, 0.05 m), 8 sides" in result.stderr
     assert json.loads(result.stdout)["new_from_old"]["scale"] == pytest.approx(0.05 / 0.7, rel=1e-4)
     assert load_scene(tmp_path / "out").unit == "metre"
@@ -312,9 +307,8 @@ def test_photos_in_several_folders_get_their_paths_for_names(tmp_path):
 def test_views_without_photos_make_no_scene(tmp_path):
     capture = capture_of([PINHOLE])
     write_colmap_binary(capture, tmp_path / "in")
-    result = nerfcli("convert", tmp_path / "in", tmp_path / "scene", "--to", "nerfcli")
-    assert result.exit_code == BAD_INPUT
-    assert "none of the 6 photos of the capture is on disk, such as photo 00.png" in error_of(result)[0]
+    error, _ = refusal("convert", tmp_path / "in", tmp_path / "scene", "--to", "nerfcli")
+    assert "none of the 6 photos of the capture is on disk, such as photo 00.png" in error
     assert not (tmp_path / "scene").exists()
 
 
@@ -323,14 +317,11 @@ def test_a_scene_is_replaced_only_with_overwrite_and_restored_after_a_fault(tmp_
     source = model_of(tmp_path, capture)
     assert nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli").exit_code == 0
     before = listing(tmp_path)
-    again = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli", "--scale", "2")
-    assert again.exit_code == BAD_INPUT
-    assert "scene.json exists" in error_of(again)[0]
+    assert "scene.json exists" in refusal("convert", source, tmp_path / "scene", "--to", "nerfcli", "--scale", "2")[0]
     right = colmap_binary.pose_rows
     monkeypatch.setattr(colmap_binary, "pose_rows", lambda model: right(model) + 1e-3)
-    fault = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli", "--overwrite")
-    assert fault.exit_code == GATE_NOT_MET
-    assert "a ray is off by" in error_of(fault)[0]
+    error, _ = refusal("convert", source, tmp_path / "scene", "--to", "nerfcli", "--overwrite", exit_code=GATE_NOT_MET)
+    assert "a ray is off by" in error
     assert listing(tmp_path) == before
     elsewhere = nerfcli("convert", source, tmp_path / "other" / "scene", "--to", "nerfcli")
     assert elsewhere.exit_code == GATE_NOT_MET
@@ -347,9 +338,7 @@ def test_a_text_model_in_the_place_of_a_scenes_model_is_kept(tmp_path):
     """Regression: it was deleted without --overwrite, as its files have other names than those of a scene."""
     write_colmap_text(photographed(capture_of([PINHOLE]), tmp_path / "images"), tmp_path / "sparse/0")
     before = listing(tmp_path)
-    result = nerfcli("convert", tmp_path, tmp_path, "--to", "nerfcli")
-    assert result.exit_code == BAD_INPUT
-    assert "sparse/0/cameras.txt exists" in error_of(result)[0]
+    assert "sparse/0/cameras.txt exists" in refusal("convert", tmp_path, tmp_path, "--to", "nerfcli")[0]
     assert listing(tmp_path) == before
 
 

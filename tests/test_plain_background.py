@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import nerfcli
+from commands import completed
 from conftest import SPHERES
 from PIL import Image
 
@@ -124,8 +124,7 @@ def test_an_object_on_black_or_white_is_learned_although_most_pixels_have_one_co
     """In contracted space, the field becomes opaque fog of this colour in front of the cameras: 11 and 18 dB."""
     put_on(tmp_path / "spheres", levels)
     run = tmp_path / "run"
-    trained = nerfcli("train", tmp_path / "spheres", "-o", run, "--steps", "120", "--threads", "1")
-    assert trained.exit_code == 0, trained.stderr
+    trained = completed("train", tmp_path / "spheres", "-o", run, "--steps", "120", "--threads", "1")
     assert "bounded scene" in trained.stderr
     assert "% of the pixels are a plain background" in trained.stderr
     assert read_log(run)[-1].get("heldout_psnr", 0.0) > 19.0
@@ -141,16 +140,14 @@ def test_an_object_on_black_or_white_is_learned_although_most_pixels_have_one_co
 )
 def test_the_field_ends_around_an_object_if_its_background_can_be_shown(tmp_path, levels, options, bounded):
     put_on(tmp_path / "spheres", levels)
-    trained = nerfcli("train", tmp_path / "spheres", "-o", tmp_path / "run", "--steps", "1", *options)
-    assert trained.exit_code == 0, trained.stderr
+    trained = completed("train", tmp_path / "spheres", "-o", tmp_path / "run", "--steps", "1", *options)
     assert (", bounded scene" if bounded else ", unbounded scene") in trained.stderr
 
 
 def test_a_resumed_training_knows_the_background_again(tmp_path):
     put_on(tmp_path / "spheres", (255, 255, 255))
     for steps in ("3", "6"):
-        trained = nerfcli("train", tmp_path / "spheres", "-o", tmp_path / "run", "--steps", steps, "--resume")
-        assert trained.exit_code == 0, trained.stderr
+        trained = completed("train", tmp_path / "spheres", "-o", tmp_path / "run", "--steps", steps, "--resume")
     assert "resumed at step 3" in trained.stderr
     assert ", bounded scene" in trained.stderr
     assert read_log(tmp_path / "run")[-1]["losses"]["sky"] > 0.0

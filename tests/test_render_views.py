@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import completed, error_of, nerfcli
+from commands import completed, nerfcli, refusal
 from PIL import Image
 from present import present
 
@@ -49,9 +49,10 @@ def test_parts_of_an_array_job_together_equal_one_rendering(finished, tmp_path):
 
 
 def test_depth_of_all_directions_is_along_the_rays(finished):
-    refused = nerfcli("render", finished, *ONE, "--lens", "equirectangular", "--width", "32", "--depth-axis", "z")
-    assert refused.exit_code == USAGE
-    assert "half of their directions are behind the camera" in error_of(refused)[0]
+    error, _ = refusal(
+        "render", finished, *ONE, "--lens", "equirectangular", "--width", "32", "--depth-axis", "z", exit_code=USAGE
+    )
+    assert "half of their directions are behind the camera" in error
     folder = rendered(finished, "--lens", "equirectangular", "--width", "32", outputs="depth")
     path = min(folder.glob("*.tiff"))
     depth = read_tiff(path)

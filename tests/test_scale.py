@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from commands import nerfcli
+from commands import completed
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
@@ -567,8 +567,7 @@ def test_positions_in_exif_give_the_scale(tmp_path):
         pose = rigid.from_parts(np.diag([1.0, -1, -1]), np.array([north, -east, 3.0]) / 10)
         frames.append(Frame(path.name, Camera.pinhole(64, 48, 50.0), pose, image=path))
     write_colmap_binary(Capture(tuple(frames), np.zeros((0, 3)), (), None, "made"), tmp_path / "in")
-    done = nerfcli("convert", tmp_path / "in", tmp_path / "out", "--to", "nerfcli", "--scale", "gps", "--json")
-    assert done.exit_code == 0, done.stderr
+    done = completed("convert", tmp_path / "in", tmp_path / "out", "--to", "nerfcli", "--scale", "gps", "--json")
     assert json.loads(done.stdout)["scale"]["metres_per_unit"] == pytest.approx(10.0, rel=2e-3)
     written = load_scene(tmp_path / "out")
     assert written.unit == "metre"
