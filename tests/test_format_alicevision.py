@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.captures.formats.alicevision import parse_alicevision
+from nerfcli.captures.formats.alicevision import FORMAT, parse_alicevision
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.errors import BAD_INPUT, UserError
@@ -210,6 +210,6 @@ def test_files_are_recognised_by_their_suffix_or_their_keys(tmp_path):
 def test_damaged_files_are_refused_with_their_field(tmp_path, change, what):
     path = write(tmp_path, content() | change)
     with pytest.raises(UserError, match=what) as caught:
-        parse_alicevision(path)
+        FORMAT.parse(path)
     assert caught.value.exit_code == BAD_INPUT
     assert str(path) in caught.value.message

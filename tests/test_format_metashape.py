@@ -8,7 +8,7 @@ import pytest
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.captures.formats.metashape import parse_metashape
+from nerfcli.captures.formats.metashape import FORMAT, parse_metashape
 from nerfcli.errors import BAD_INPUT, UserError
 
 # At (1, 2, 3) in the chunk, turned a quarter about y: the camera's z axis along chunk x.
@@ -265,7 +265,7 @@ def test_malformed_files_are_refused_with_file_and_field(tmp_path, change, what)
     assert change[0] in text
     path = write(tmp_path, text.replace(*change))
     with pytest.raises(UserError, match=what) as caught:
-        parse_metashape(path)
+        FORMAT.parse(path)
     assert caught.value.exit_code == BAD_INPUT
     assert str(path) in caught.value.message
 

@@ -10,7 +10,7 @@ import pytest
 from captures import ring
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.captures.formats.opensfm import losses_opensfm, parse_opensfm, write_opensfm
+from nerfcli.captures.formats.opensfm import FORMAT, losses_opensfm, parse_opensfm, write_opensfm
 from nerfcli.errors import BAD_INPUT, UserError
 
 AFFINE = {"focal_x": 0.9, "focal_y": 0.93, "c_x": 0.021, "c_y": -0.013}
@@ -183,7 +183,7 @@ SHOT = reconstruction()["shots"]["a.jpg"]
 def test_malformed_files_are_refused_with_file_and_field(tmp_path, change, what):
     path = write_file(tmp_path / "reconstruction.json", {**reconstruction(), **change})
     with pytest.raises(UserError, match=what) as caught:
-        parse_opensfm(path)
+        FORMAT.parse(path)
     assert caught.value.exit_code == BAD_INPUT
     assert str(path) in caught.value.message
 

@@ -9,7 +9,7 @@ from captures import put_photos
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.formats.format import UserInputs
-from nerfcli.captures.formats.reality_capture import parse_reality_capture
+from nerfcli.captures.formats.reality_capture import TABLE, parse_reality_capture
 from nerfcli.errors import BAD_INPUT, UserError
 
 OLD = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"
@@ -135,6 +135,6 @@ def test_malformed_files_are_refused_with_file_and_line(tmp_path, rows, header, 
     put_photos(tmp_path, "a.jpg", "b.jpg")
     path = write(tmp_path, *rows, header=header)
     with pytest.raises(UserError, match=what) as caught:
-        parse_reality_capture(path)
+        TABLE.parse(path)
     assert caught.value.exit_code == BAD_INPUT
     assert str(path) in caught.value.message

@@ -14,7 +14,7 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import run_cameras
-from nerfcli.captures.formats.format import Format, UserInputs
+from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.captures.holdout import HELD_OUT_EVERY, default_split, names_held_out
@@ -48,7 +48,7 @@ def load_scene(path: str | Path, *, holdout: str | None = None) -> Capture:
             f"give the scene it was trained on, or {in_shell(found)} for its refined cameras; to continue it: nerfcli "
             f"train SCENE -o {in_shell(path)} --resume",
         )
-    scene = with_photos_on_disk(path, form, found, form.parse(found, UserInputs()))
+    scene = with_photos_on_disk(path, form, found, form.parse(found))
     if holdout is None:
         return scene
     names = names_held_out(holdout, (frame.name for frame in scene.frames), others=scene.missing)

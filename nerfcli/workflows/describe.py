@@ -13,7 +13,6 @@ import numpy as np
 from nerfcli.cameras.camera import by_lens
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import vector_from_rotation
-from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.registry import recognise, recognised, refuse_archive
 from nerfcli.captures.formats.run_cameras import CAMERAS
 from nerfcli.captures.loading import describe_unused_masks, fingerprint, with_photos_on_disk
@@ -88,7 +87,7 @@ def _camera_facts(frames: Iterable[Frame]) -> dict[str, Any]:
 
 def _describe_capture(path: Path) -> dict[str, Any]:
     form, found = recognise(path)
-    capture = form.parse(found, UserInputs())
+    capture = form.parse(found)
     if not any(frame.has_photo for frame in capture.frames):
         return {
             "kind": form.name,

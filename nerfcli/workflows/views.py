@@ -10,7 +10,6 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame, frames_named
 from nerfcli.cameras.framing import Window, cropped, equirectangular, sized, with_lens
 from nerfcli.captures.formats.camera_path import find_camera_path, read_path
-from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.captures.loading import with_photos_on_disk
 from nerfcli.errors import UserError
@@ -179,7 +178,7 @@ def _frames_of(path: Path) -> tuple[Frame, ...]:
             f"give test, train, {', '.join(PATHS)}, or a file or folder of cameras that nerfcli convert reads",
         )
     form, found = recognise(path)
-    capture = form.parse(found, UserInputs())
+    capture = form.parse(found)
     if path.is_dir() and form.name != "run" and any(frame.has_photo for frame in capture.frames):
         return with_photos_on_disk(path, form, found, capture).frames
     return capture.frames

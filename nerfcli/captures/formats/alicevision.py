@@ -23,7 +23,6 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import (
-    check_unique_names,
     malformed,
     name_of,
     number,
@@ -79,7 +78,6 @@ def parse_alicevision(path: Path, given: UserInputs = UserInputs()) -> Capture:
         if not isinstance(camera, str) or camera not in cameras:
             raise malformed(where, f"intrinsicId is {shown(camera)}", "expected the id of one of the intrinsics")
         frames.append(Frame(place, cameras[camera], world_from_cam))
-    check_unique_names((frame.name for frame in frames), path)
     sizes = [frame.camera.size for frame in frames]
     found = find_photos([frame.name for frame in frames], (path.parent,), given=given.images, sizes=sizes)
     for index, (frame, image) in enumerate(zip(frames, found.paths, strict=True)):

@@ -18,17 +18,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
-from nerfcli.captures.formats.fields import (
-    check_unique_names,
-    malformed,
-    matrix_of,
-    name_of,
-    numbers,
-    read_rows,
-    read_text,
-    shown,
-    size_of,
-)
+from nerfcli.captures.formats.fields import malformed, matrix_of, name_of, numbers, read_rows, read_text, shown, size_of
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.limits import FramePoses, rigid_pose
 from nerfcli.captures.formats.photo_names import with_photos
@@ -55,7 +45,6 @@ def parse_euroc(home: Path, given: UserInputs = UserInputs()) -> Capture:
             views.append(view)
     body_seconds = [(time - times[0]) / 1e9 for time in times]
     kept, poses, unposed = photos_at(names, seconds, body_seconds, bodies, where=str(truth))
-    check_unique_names([names[index] for index in kept], home)
     frames = tuple(
         Frame(names[index], views[index][0], pose @ views[index][1]) for index, pose in zip(kept, poses, strict=True)
     )

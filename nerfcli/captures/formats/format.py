@@ -12,7 +12,7 @@ from typing import Any
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import opened, read_json_object
+from nerfcli.captures.formats.fields import check_unique_names, opened, read_json_object
 from nerfcli.errors import UserError
 
 
@@ -39,7 +39,7 @@ class Format:
         of: what it is, or which programs write it.
         looked_for: what it is recognised by, in a few words for people; "" for formats that are only written.
         find: returns where such a capture is in a file or folder; None if there is none.
-        parse: reads what `find` found, or what `write` wrote, with the further input of the user; what is damaged is a
+        read: reads what `find` found, or what `write` wrote, with the further input of the user; what is damaged is a
             `UserError` that names file and field.
         axes: the camera axes of its poses, as three letters or a name.
         open_axes: whether poses with other axes are found in such files, so that --axes makes sense.
@@ -61,7 +61,7 @@ class Format:
     of: str
     looked_for: str
     find: Callable[[Path], Path | None]
-    parse: Callable[[Path, UserInputs], Capture]
+    read: Callable[[Path, UserInputs], Capture]
     axes: str = "opencv"
     open_axes: bool = False
     open_centre: bool = False
@@ -76,6 +76,13 @@ class Format:
     write: Callable[[Capture, Path], None] | None = None
     losses: Callable[[Capture], tuple[str, ...]] | None = None
     video: Callable[[Path], Path | None] = lambda path: None
+
+    def parse(self, found: Path, given: UserInputs = UserInputs()) -> Capture:
+        """Read what `find` found, or what `write` wrote; without frames, or with two of one name, it is refused."""
+        capture = self.read(found, given)
+        if "poses" not in self.lacks:
+            check_unique_names((frame.name for frame in capture.frames), found)
+        return capture
 
 
 def named(*names: str) -> Callable[[Path], Path | None]:

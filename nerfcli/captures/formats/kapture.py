@@ -16,16 +16,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import (
-    Row,
-    check_unique_names,
-    malformed,
-    name_of,
-    numbers,
-    read_rows,
-    shown,
-    size_of,
-)
+from nerfcli.captures.formats.fields import Row, malformed, name_of, numbers, read_rows, shown, size_of
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.limits import NotFiniteError, checked_camera, left_out, without
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, with_photos
@@ -68,7 +59,6 @@ def parse_kapture(folder: Path, given: UserInputs = UserInputs()) -> Capture:
         if sensor not in known:
             known[sensor] = _camera(cameras[sensor], given.camera)
         frames.append(Frame(name, known[sensor], rigid.inverse(device_from_world)))
-    check_unique_names((frame.name for frame in frames), folder)
     points, colours = _points(folder / "reconstruction/points3d.txt")
     notes = (*left_out(lost, len(frames) + len(lost)), *without(unposed, "a pose"))
     capture = Capture(tuple(frames), points, kind="kapture", colours=colours, notes=notes)

@@ -24,16 +24,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import (
-    check_unique_names,
-    malformed,
-    matrix_of,
-    name_of,
-    numbers,
-    read_xml,
-    shown,
-    size_of,
-)
+from nerfcli.captures.formats.fields import malformed, matrix_of, name_of, numbers, read_xml, shown, size_of
 from nerfcli.captures.formats.format import Format, by_suffix
 from nerfcli.captures.formats.lenses import Fits, Terms
 from nerfcli.captures.formats.limits import FramePoses, checked_camera, rigid_pose
@@ -99,7 +90,6 @@ def parse_metashape(path: Path) -> Capture:
         world_from_cam = chunk_from_cam if world_from_chunk is None else world_from_chunk.apply_pose(chunk_from_cam)
         frames.append(Frame(name, cameras[sensor], world_from_cam))
     notes = (*notes, *poses.notes(), *fits.notes())
-    check_unique_names((frame.name for frame in frames), path)
     return Capture(tuple(frames), kind="metashape", notes=notes)
 
 

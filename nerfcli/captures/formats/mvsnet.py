@@ -18,7 +18,7 @@ import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import check_unique_names, malformed, matrix_of, numbers, read_text
+from nerfcli.captures.formats.fields import malformed, matrix_of, numbers, read_text
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses
@@ -49,7 +49,6 @@ def parse_mvsnet(folder: Path, given: UserInputs = UserInputs()) -> Capture:
             frames.append(Frame(image.name, camera, pose, image=image))
             bounds.append(_bounds(depths))
     notes = (*photos.notes, *poses.notes(), *fits.notes())
-    check_unique_names((frame.name for frame in frames), folder)
     known = np.array(bounds) if None not in bounds else None
     return Capture(tuple(frames), missing=photos.missing, depth_bounds=known, kind="mvsnet", notes=notes)
 

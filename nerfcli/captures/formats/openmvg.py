@@ -22,7 +22,6 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture, Observations
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import (
-    check_unique_names,
     malformed,
     matrix,
     name_of,
@@ -73,7 +72,6 @@ def parse_openmvg(path: Path, given: UserInputs = UserInputs()) -> Capture:
         elif (pose := usable.read(name, f"{record[1]}: rotation", partial(_matrix, *record))) is not None:
             frame_of[key] = len(frames)
             frames.append(Frame(name, camera, pose, image=path.parent / name))
-    check_unique_names((frame.name for frame in frames), path)
     points, observations = _structure(content, frame_of, path)
     notes = (*usable.notes(), *without(unposed, "a pose"))
     capture = Capture(tuple(frames), points, kind="openmvg", observations=observations, notes=notes)

@@ -22,17 +22,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
-from nerfcli.captures.formats.fields import (
-    check_unique_names,
-    malformed,
-    name_of,
-    number,
-    read_json,
-    record_of,
-    shown,
-    size_of,
-    vector,
-)
+from nerfcli.captures.formats.fields import malformed, name_of, number, read_json, record_of, shown, size_of, vector
 from nerfcli.captures.formats.format import Format, find_json
 from nerfcli.captures.formats.limits import FramePoses, checked_camera, plausible
 from nerfcli.captures.formats.photo_names import with_photos
@@ -93,7 +83,6 @@ def parse_opensfm(path: Path) -> Capture:
         if pose is not None:
             frames.append(Frame(name, cameras[camera], pose, image=path.parent / IMAGE_FOLDER / name))
     notes += poses.notes()
-    check_unique_names((frame.name for frame in frames), path)
     points, colours = _points(content, path)
     unit = "metre" if _is_on_earth(content, path) else "arbitrary"
     return Capture(tuple(frames), points, (), None, "opensfm", colours=colours, unit=unit, notes=notes)

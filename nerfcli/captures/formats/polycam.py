@@ -17,7 +17,7 @@ import numpy as np
 from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
 from nerfcli.captures.axes import opencv_pose
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import check_unique_names, number, read_json_object, size_of
+from nerfcli.captures.formats.fields import number, read_json_object, size_of
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.limits import FramePoses, checked_camera
 from nerfcli.captures.formats.photo_names import find_photos
@@ -60,7 +60,6 @@ def parse_polycam(folder: Path, given: UserInputs = UserInputs()) -> Capture:
     left = (f"{whole - len(stems)} of {whole} keyframes left out, whose poses Polycam has not corrected",)
     notes = (*photos.notes, *poses.notes(), *(left if whole > len(stems) else ()))
     source = "LiDAR (Polycam)"
-    check_unique_names((frame.name for frame in frames), folder)
     return Capture(tuple(frames), missing=photos.missing, kind="polycam", unit="metre", unit_source=source, notes=notes)
 
 

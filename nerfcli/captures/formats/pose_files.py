@@ -21,15 +21,7 @@ import numpy as np
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import (
-    check_unique_names,
-    content_lines,
-    malformed,
-    numbers,
-    opened,
-    read_text,
-    size_of,
-)
+from nerfcli.captures.formats.fields import content_lines, malformed, numbers, opened, read_text, size_of
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses, checked_camera
@@ -79,7 +71,6 @@ def parse_pose_files(folder: Path, given: UserInputs = UserInputs()) -> Capture:
             depth = SensorDepth.found(*maps, unit=MILLIMETRE)
             frames.append(Frame(image.name, own_camera, world_from_cam, image=image, split=split, depth=depth))
     notes = (*photos.notes, *poses.notes(), *fits.notes())
-    check_unique_names((frame.name for frame in frames), folder)
     return Capture(tuple(frames), missing=photos.missing, kind="pose-files", notes=notes)
 
 

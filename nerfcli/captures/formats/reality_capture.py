@@ -26,16 +26,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.axes import opencv_pose
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import (
-    check_unique_names,
-    malformed,
-    matrix_of,
-    name_of,
-    numbers,
-    read_text,
-    read_xml,
-    shown,
-)
+from nerfcli.captures.formats.fields import malformed, matrix_of, name_of, numbers, read_text, read_xml, shown
 from nerfcli.captures.formats.format import Format, UserInputs, by_suffix, only_file
 from nerfcli.captures.formats.lenses import Fits, Terms
 from nerfcli.captures.formats.limits import FramePoses, NotFiniteError, left_out
@@ -111,7 +102,8 @@ def _table(path: Path) -> tuple[list[str], np.ndarray, list[str], tuple[str, ...
         names.append(name)
         places.append(where)
     notes = left_out(lost, len(names) + len(lost))
-    check_unique_names(names, path)
+    if not rows:
+        raise malformed(path, "lists no images with a pose", _EXPECTED)
     return names, np.array(rows), places, notes
 
 

@@ -16,15 +16,7 @@ import numpy as np
 from nerfcli.cameras.frame import Frame, SensorDepth
 from nerfcli.captures.axes import opencv_pose
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import (
-    check_unique_names,
-    malformed,
-    number,
-    read_json_object,
-    shown,
-    size_of,
-    vector,
-)
+from nerfcli.captures.formats.fields import malformed, number, read_json_object, shown, size_of, vector
 from nerfcli.captures.formats.format import Format, UserInputs, has_keys, named
 from nerfcli.captures.formats.limits import FramePoses, checked_camera
 from nerfcli.captures.formats.photo_names import find_photos
@@ -57,7 +49,6 @@ def parse_record3d(path: Path, given: UserInputs = UserInputs()) -> Capture:
             maps = (path.parent / "depth" / f"{index}.exr", image.with_suffix(".exr"), image.with_suffix(".depth"))
             depth = SensorDepth.found(*maps, confidence=image.with_suffix(".conf"))
             frames.append(Frame(image.name, camera, pose, image=image, depth=depth))
-    check_unique_names((frame.name for frame in frames), path)
     notes, source = (*photos.notes, *usable.notes()), "ARKit (Record3D)"
     return Capture(
         tuple(frames), missing=photos.missing, kind="record3d", unit="metre", unit_source=source, notes=notes

@@ -38,7 +38,7 @@ from nerfcli.captures.formats import (
     transforms,
     tum_rgbd,
 )
-from nerfcli.captures.formats.format import Format, UserInputs
+from nerfcli.captures.formats.format import Format
 from nerfcli.errors import UserError, in_shell, several
 from nerfcli.photos.images import list_images
 from nerfcli.photos.masks import mask_of
@@ -151,7 +151,7 @@ def depths_beside(photos: Path) -> dict[str, SensorDepth]:
     home = photos.resolve()
     try:
         around = recognised(home.parent)
-        frames = () if around is None else around[0].parse(around[1], UserInputs()).frames
+        frames = () if around is None else around[0].parse(around[1]).frames
     except (UserError, OSError):
         return {}
     inside = [(frame.image.resolve(), frame.depth) for frame in frames if frame.image and frame.depth]

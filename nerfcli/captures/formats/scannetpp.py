@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import check_unique_names, malformed, read_json_object
+from nerfcli.captures.formats.fields import malformed, read_json_object
 from nerfcli.captures.formats.format import Format, UserInputs, has_keys
 from nerfcli.captures.formats.photo_search import plain_name
 from nerfcli.captures.formats.transforms import listed_frames, records_of
@@ -38,7 +38,6 @@ def parse_scannetpp(path: Path, given: UserInputs = UserInputs()) -> Capture:
     if not good:
         raise malformed(path, "marks all photos as bad", "copy the scene again")
     frames, missing, notes = listed_frames(path, content, good, images=given.images, home=home, folders=folders)
-    check_unique_names((frame.name for frame in frames), path)
     split_of = {plain_name(str(record.get("file_path"))): split for record, _, split in both}
     if "test" in (splits := [split_of.get(frame.name) for frame in frames]):
         frames = [replace(frame, split=split) for frame, split in zip(frames, splits, strict=True)]

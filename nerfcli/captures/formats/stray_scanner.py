@@ -15,7 +15,7 @@ import numpy as np
 
 from nerfcli.cameras.frame import MILLIMETRE, Frame, SensorDepth
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import check_unique_names, malformed, numbers, read_rows
+from nerfcli.captures.formats.fields import malformed, numbers, read_rows
 from nerfcli.captures.formats.format import Format, UserInputs, folder_with
 from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses
@@ -35,8 +35,7 @@ _EXPECTED = "expected the table of Stray Scanner: timestamp, frame, x, y, z, qx,
 
 def parse_stray_scanner(folder: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the frames whose photo is on disk, or all frames if none is; the unit is the metre, by ARKit."""
-    path = folder / ODOMETRY
-    rows = _rows(path)
+    rows = _rows(folder / ODOMETRY)
     found = _photos(list(rows), folder, given.images)
     there = [image for image in found.paths if image is not None]
     if there:
@@ -64,7 +63,6 @@ def parse_stray_scanner(folder: Path, given: UserInputs = UserInputs()) -> Captu
         maps, number = folder / "depth", f"{index:06d}.png"
         depth = SensorDepth.found(maps / number, unit=MILLIMETRE, confidence=folder / "confidence" / number)
         frames.append(Frame(name if image is None else image.name, camera, pose, image=image, depth=depth))
-    check_unique_names((frame.name for frame in frames), path)
     notes = (*found.notes, *poses.notes(), *fits.notes())
     if there and len(there) < len(rows):
         notes += (f"{len(there)} of the {len(rows)} frames with a pose have a photo",)

@@ -18,16 +18,7 @@ from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import (
-    Row,
-    check_unique_names,
-    malformed,
-    matrix_of,
-    numbers,
-    opened,
-    read_rows,
-    shown,
-)
+from nerfcli.captures.formats.fields import Row, malformed, matrix_of, numbers, opened, read_rows, shown
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.limits import FramePoses, without
 from nerfcli.captures.formats.photo_names import GIVE_CAMERA, with_photos
@@ -80,7 +71,6 @@ def _parsed(path: Path, given: UserInputs, read: Callable[[Path], Poses], *, kin
     if given.camera is None:
         raise UserError(f"{path}: a {kind.upper()} trajectory contains poses but no camera", GIVE_CAMERA)
     poses, notes = read(path)
-    check_unique_names((name for name, _ in poses), path)
     frames = tuple(Frame(name, given.camera, world_from_cam) for name, world_from_cam in poses)
     return with_photos(Capture(frames, kind=kind, notes=notes), given=given.images)
 

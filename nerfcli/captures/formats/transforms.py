@@ -19,7 +19,7 @@ from nerfcli.captures.axes import opencv_pose, pose_in_axes
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.alicevision import find_alicevision
 from nerfcli.captures.formats.camera_path import find_camera_path
-from nerfcli.captures.formats.fields import check_unique_names, malformed, matrix, read_json_object
+from nerfcli.captures.formats.fields import malformed, matrix, read_json_object
 from nerfcli.captures.formats.format import Format, UserInputs, find_json
 from nerfcli.captures.formats.lenses import Fits
 from nerfcli.captures.formats.limits import FramePoses
@@ -54,7 +54,6 @@ def parse_transforms(path: Path, given: UserInputs = UserInputs()) -> Capture:
     """
     content = read_json_object(path)
     frames, missing, notes = listed_frames(path, content, records_of(path, content), images=given.images)
-    check_unique_names((frame.name for frame in frames), path)
     points, colours, lost = _points_beside(path, content)
     return Capture(tuple(frames), points, tuple(missing), kind="transforms", colours=colours, notes=(*notes, *lost))
 
