@@ -8,16 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerfcli.cameras import projections
 from nerfcli.cameras.distortion import Distortion
-from nerfcli.cameras.projections import (
-    Division,
-    EnhancedUnified,
-    Equidistant,
-    Equirectangular,
-    FieldOfView,
-    Perspective,
-    Projection,
-)
 
 # A pixel's direction is valid only if it projects back to within this distance of the pixel.
 MAX_MISMATCH_PX = 1e-3
@@ -48,12 +40,12 @@ DISTORTIONS: dict[str, tuple[dict[str, tuple[str, ...]], ...]] = {
     "EQUIRECTANGULAR": (),
 }
 # The projections that are neither perspective nor equidistant, and their parameters.
-_PROJECTIONS: dict[str, tuple[Callable[..., Projection], tuple[str, ...]]] = {
-    "FOV": (FieldOfView, ("omega",)),
-    "SIMPLE_DIVISION": (Division, ("k",)),
-    "DIVISION": (Division, ("k",)),
-    "EUCM": (EnhancedUnified, ("alpha", "beta")),
-    "EQUIRECTANGULAR": (Equirectangular, ()),
+_PROJECTIONS: dict[str, tuple[Callable[..., projections.Projection], tuple[str, ...]]] = {
+    "FOV": (projections.FieldOfView, ("omega",)),
+    "SIMPLE_DIVISION": (projections.Division, ("k",)),
+    "DIVISION": (projections.Division, ("k",)),
+    "EUCM": (projections.EnhancedUnified, ("alpha", "beta")),
+    "EQUIRECTANGULAR": (projections.Equirectangular, ()),
 }
 
 
@@ -70,7 +62,7 @@ class Lens:
             those of the distortions in their order, then fx, fy, cx and cy.
     """
 
-    projection: Projection
+    projection: projections.Projection
     distortions: tuple[Distortion, ...]
     focal_px: np.ndarray
     principal_point: np.ndarray
@@ -135,7 +127,7 @@ def lens_of(model: str, values: dict[str, float]) -> Lens:
     distortions = tuple(
         Distortion(**{term: tuple(values[name] for name in names) for term, names in group.items()}) for group in groups
     )
-    usual = Equidistant if model.endswith("FISHEYE") else Perspective
+    usual = projections.Equidistant if model.endswith("FISHEYE") else projections.Perspective
     project, parameters = _PROJECTIONS.get(model, (usual, ()))
     inner = [{name: 1.0} for name in parameters]
     inner += [{name: 1.0} for group in groups for names in group.values() for name in names]

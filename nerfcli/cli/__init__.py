@@ -37,22 +37,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for _module in (
-    doctor,
-    poses,
-    train,
-    evaluate,
-    render,
-    view,
-    export,
-    report,
-    run,
-    info,
-    convert,
-    selftest,
-    bench,
-    ablate,
-):
+_COMMANDS = (doctor, poses, train, evaluate, render, view, export, report, run, info, convert, selftest, bench, ablate)
+for _module in _COMMANDS:
     _name = _module.__name__.rsplit(".", 1)[-1]
     app.command(_name, cls=PhotoCommand)(getattr(_module, _name))
 app.add_typer(ct.app, name="ct")

@@ -20,16 +20,8 @@ if TYPE_CHECKING:
     from nerfcli.captures.world import WorldFrame
 
 FORMATS_WRITTEN = (
-    "nerfcli",
-    "colmap",
-    "colmap-text",
-    "transforms",
-    "blender",
-    "llff",
-    "opensfm",
-    "tum",
-    "kitti",
-    "ply",
+    *("nerfcli", "colmap", "colmap-text", "transforms", "blender", "llff", "opensfm"),
+    *("tum", "kitti", "ply"),
 )
 # Names of programs that are accepted for the format that they read.
 PROGRAMS = {"nerfstudio": "transforms", "instant-ngp": "transforms"}

@@ -12,18 +12,9 @@ if TYPE_CHECKING:
     from nerfcli.kernels.selftest.measure import Errors, Row
 
 _COLUMNS = (
-    "case",
-    "operation",
-    "precision",
-    "error",
-    "of gradient",
-    "bound",
-    "verdict",
-    "textbook error",
-    "of its gradient",
-    "ms",
+    *("case", "operation", "precision", "error", "of gradient", "bound", "verdict"),
+    *("textbook error", "of its gradient", "ms"),
 )
-_VALUE_ONLY = "value only"
 _STYLES = {"met": "green", "not met": "bold red"}
 
 
@@ -77,16 +68,10 @@ def _pair(errors: "Errors | None") -> tuple[str, str]:
 
 
 def _cells(row: "Row") -> tuple[str, ...]:
-    milliseconds = "" if row.seconds is None else f"{1e3 * row.seconds:.1f}"
     error, gradient = _pair(row.errors)
-    shown = (
-        error,
-        _VALUE_ONLY if row.no_gradient else gradient,
-        _number(row.bounds.value),
-        row.verdict,
-        *_pair(row.textbook),
-        milliseconds,
-    )
+    gradient = "value only" if row.no_gradient else gradient
+    milliseconds = "" if row.seconds is None else f"{1e3 * row.seconds:.1f}"
+    shown = (error, gradient, _number(row.bounds.value), row.verdict, *_pair(row.textbook), milliseconds)
     return (row.case, row.operation, row.precision, *shown)
 
 

@@ -21,14 +21,7 @@ from nerfcli.splats.render import SplatScene
 from nerfcli.training.runs.run import Run, load_run
 from nerfcli.workflows.photo_depths import depth_errors, photo_depths
 from nerfcli.workflows.splats import file_digest, load_splats
-from nerfcli.workflows.views import (
-    PATHS,
-    Views,
-    chosen_frames,
-    frames_of_file,
-    refuse_z_depth_for_equirectangular,
-    usual_depth,
-)
+from nerfcli.workflows.views import PATHS, Views, chosen_frames, frames_of_file, refuse_z_of_panoramas, usual_depth
 
 RENDERS = "renders"
 HELD_OUT = Views("test")
@@ -100,7 +93,7 @@ def render_run(
     # The unit of the training frame is about the distance between the cameras and what they look at.
     frames = chosen_frames(trained, views, depth_hint=1.0 / model.training_from_scene.scale)
     if splats is None and "depth" in settings.outputs and settings.depth.axis == "z":
-        refuse_z_depth_for_equirectangular(frames, notify=reporter.note)
+        refuse_z_of_panoramas(frames, notify=reporter.note)
     job = RenderJob(tuple(frames), settings, provenance, seen, errors)
     return render_job(shown, job, replace(output, path=folder), part=views.part, reporter=reporter)
 

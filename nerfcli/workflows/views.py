@@ -145,7 +145,7 @@ def usual_depth(run: Run, views: Views) -> DepthRequest:
     return DepthRequest(convention="conditional", axis=usual_axis(run, views))
 
 
-def refuse_z_depth_for_equirectangular(frames: Sequence[Frame], *, notify: Notify) -> None:
+def refuse_z_of_panoramas(frames: Sequence[Frame], *, notify: Notify) -> None:
     """Refuse depth along the optical axis, z, for pictures of all directions: half of them is behind the camera.
 
     Raises:
