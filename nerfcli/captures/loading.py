@@ -18,7 +18,7 @@ from nerfcli.captures.formats.format import Format
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.captures.holdout import HELD_OUT_EVERY, default_split, names_held_out
-from nerfcli.captures.orientation import UPRIGHT, counted, rescaling, upright
+from nerfcli.captures.orientation import UPRIGHT, rescaled_sizes, upright
 from nerfcli.errors import UserError, in_shell, several
 from nerfcli.photos.images import list_photos
 from nerfcli.photos.masks import masks_inside
@@ -124,7 +124,7 @@ def with_photos_on_disk(path: Path, form: Format, found: Path, capture: Capture)
         depth_bounds=None if capture.depth_bounds is None else capture.depth_bounds[kept],
         observations=None,
         pixels=UPRIGHT,
-        rescaled=counted(rescaling(frames[index].camera, frame.camera) for index, frame in fitted.items()),
+        rescaled=rescaled_sizes((frames[index].camera, frame.camera) for index, frame in fitted.items()),
         provenance=capture.provenance or {"from": form.name},
     )
 

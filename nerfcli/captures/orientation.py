@@ -136,18 +136,18 @@ def turned(camera: Camera, world_from_cam: np.ndarray, *, orientation: int) -> t
     return upright, world_from_cam @ stored_from_upright
 
 
-def rescaling(calibrated: Camera, fitted: Camera) -> tuple[Size, Size] | None:
-    """Return the sizes of a calibration and of the picture it was fitted to, both upright; None if they are equal."""
-    size, other = fitted.size, calibrated.size
-    if size in (other, other[::-1]):
-        return None
-    lying = (other[0] < other[1]) != (size[0] < size[1])
-    return ((other[1], other[0]) if lying else other), size
+def rescaled_sizes(fits: Iterable[tuple[Camera, Camera]]) -> dict[tuple[Size, Size], int]:
+    """Count the cameras that were fitted to a picture of another size, by both sizes, upright; see `Capture.rescaled`.
 
-
-def counted(sizes: Iterable[tuple[Size, Size] | None]) -> dict[tuple[Size, Size], int]:
-    """Count the pairs of sizes that `rescaling` returned."""
-    return dict(Counter(pair for pair in sizes if pair is not None))
+    Args:
+        fits: calibrated and fitted cameras.
+    """
+    counts = Counter[tuple[Size, Size]]()
+    for (of_width, of_height), size in ((calibrated.size, fitted.size) for calibrated, fitted in fits):
+        if size not in ((of_width, of_height), (of_height, of_width)):
+            lying = (of_width < of_height) != (size[0] < size[1])
+            counts[(of_height, of_width) if lying else (of_width, of_height), size] += 1
+    return dict(counts)
 
 
 def describe_rescaling(rescaled: Mapping[tuple[Size, Size], int]) -> list[str]:
@@ -236,7 +236,7 @@ def other_sizes(capture: Capture) -> dict[tuple[Size, Size], int]:
         UserError: a photo has another shape than its camera.
     """
     chosen = np.unique(np.linspace(0, len(capture.frames) - 1, _MOST_MEASURED).round().astype(int))
-    sizes = []
+    fits = []
     for frame in (capture.frames[index] for index in chosen):
         if not frame.has_photo:
             continue
@@ -246,9 +246,8 @@ def other_sizes(capture: Capture) -> dict[tuple[Size, Size], int]:
             turn_to_upright(frame.camera, picture)
         except UserError:  # the commands that use the photos say what is wrong with them
             continue
-        fitted, _ = fit_to_picture(frame.camera, frame.world_from_cam, picture)
-        sizes.append(rescaling(frame.camera, fitted))
-    return counted(sizes)
+        fits.append((frame.camera, fit_to_picture(frame.camera, frame.world_from_cam, picture)[0]))
+    return rescaled_sizes(fits)
 
 
 def _turned_observations(capture: Capture, turns: np.ndarray) -> Observations | None:

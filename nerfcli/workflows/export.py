@@ -195,11 +195,8 @@ def _description(run: Run, model: Model, kind: str, grid: Grid) -> dict[str, Any
 
 
 def _grid_in_words(grid: Grid, model: Model) -> str:
-    return f"{'x'.join(map(str, grid.shape))} voxels of {grid.voxel_size:.4g} {_unit_of(model)}"
-
-
-def _unit_of(model: Model) -> str:
-    return "m" if model.unit == "metre" else "units of the scene"
+    unit = "m" if model.unit == "metre" else "units of the scene"
+    return f"{'x'.join(map(str, grid.shape))} voxels of {grid.voxel_size:.4g} {unit}"
 
 
 def _columns(places: np.ndarray, normals: np.ndarray, colours: np.ndarray) -> dict[str, np.ndarray]:

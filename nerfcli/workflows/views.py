@@ -115,8 +115,18 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
 
 
 def frames_of_file(views: Views) -> list[Frame]:
-    """Return the frames of a file or folder of cameras."""
-    return _presented(_frames_of(Path(views.cameras)), views)
+    """Return the frames of a file or folder of cameras: in a folder, those of the photos there, rescaled to them."""
+    path = Path(views.cameras)
+    if not path.exists():
+        raise UserError(
+            f"no cameras found at {path}",
+            f"give test, train, {', '.join(PATHS)}, or a file or folder of cameras that nerfcli convert reads",
+        )
+    form, found = recognise(path)
+    capture = form.parse(found)
+    if path.is_dir() and form.name != "run" and any(frame.has_photo for frame in capture.frames):
+        capture = with_photos_on_disk(path, form, found, capture)
+    return _presented(capture.frames, views)
 
 
 def _presented(chosen: Sequence[Frame], views: Views) -> list[Frame]:
@@ -168,20 +178,6 @@ def file_fps(cameras: str) -> float | None:
     path = Path(cameras)
     found = find_camera_path(path) if path.is_file() else None
     return None if found is None else read_path(found).fps
-
-
-def _frames_of(path: Path) -> tuple[Frame, ...]:
-    """Return the cameras of a capture: in a folder, those of the photos that are there, rescaled to them."""
-    if not path.exists():
-        raise UserError(
-            f"no cameras found at {path}",
-            f"give test, train, {', '.join(PATHS)}, or a file or folder of cameras that nerfcli convert reads",
-        )
-    form, found = recognise(path)
-    capture = form.parse(found)
-    if path.is_dir() and form.name != "run" and any(frame.has_photo for frame in capture.frames):
-        return with_photos_on_disk(path, form, found, capture).frames
-    return capture.frames
 
 
 def _within(camera: Camera, max_size: int) -> Camera:

@@ -67,11 +67,16 @@ def _encoding(data: bytes) -> str:
 def read_text(path: Path, expected: str) -> str:
     """Read the text of a file in UTF-8, with or without a byte order mark, or in UTF-16 with one."""
     try:
-        return decoded(path.read_bytes())
-    except OSError as error:
-        raise malformed(path, error.strerror or str(error), expected) from error
+        return decoded(_read_bytes(path, expected))
     except UnicodeDecodeError as error:
         raise malformed(path, f"not UTF-8 text (byte {error.start})", expected) from error
+
+
+def _read_bytes(path: Path, expected: str) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise malformed(path, error.strerror or str(error), expected) from error
 
 
 def read_json(path: Path, expected: str) -> Any:
@@ -96,10 +101,6 @@ def read_xml(path: Path, expected: str) -> ElementTree.Element:
 
     A file that declares a document type is refused, as it may have entities to expand.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise malformed(path, error.strerror or str(error), expected) from error
 
     def refuse(*_: object) -> NoReturn:
         raise malformed(path, "declares a document type (DOCTYPE)", expected)
@@ -112,7 +113,7 @@ def read_xml(path: Path, expected: str) -> ElementTree.Element:
     parser.EndElementHandler = builder.end
     parser.CharacterDataHandler = builder.data
     try:
-        parser.Parse(data, True)
+        parser.Parse(_read_bytes(path, expected), True)
     except (expat.ExpatError, ValueError, LookupError) as error:  # the latter two: an encoding that Python lacks
         raise malformed(path, f"not valid XML: {error}", expected) from error
     return builder.close()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from nerfcli.captures.calibration import Calibration, PhotoCalibration, calibrated
-from nerfcli.captures.orientation import Picture, counted, describe_rescaling, rescaling
+from nerfcli.captures.orientation import Picture, describe_rescaling, rescaled_sizes
 from nerfcli.errors import UserError, listed, several
 from nerfcli.photos.exif import Exif
 from nerfcli.photos.focal_evidence import focal_evidence
@@ -148,5 +148,5 @@ def _notes(calibration: Calibration, found: Sequence[PhotoCalibration]) -> tuple
     ways = [f"{count} by {how}" for count, how in ((named, "name"), (len(found) - named, "size")) if count]
     used = len({one.number for one in found})
     first = f"intrinsics of {calibration.path}: {several(used, 'camera')} for {len(found)} photos, {' and '.join(ways)}"
-    other_sizes = counted(rescaling(calibration.cameras[one.number], one.camera) for one in found)
+    other_sizes = rescaled_sizes((calibration.cameras[one.number], one.camera) for one in found)
     return (first, *describe_rescaling(other_sizes))
