@@ -1,16 +1,19 @@
 """Small captures of every camera model with known truth, and comparisons of captures, for tests of capture formats."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture, Observations
+from nerfcli.errors import BAD_INPUT, UserError
 
 # Every model of COLMAP, with all of its terms in use.
 CAMERAS = {
@@ -108,6 +111,15 @@ def reprojection_px(truth: Capture, other: Capture) -> float:
     return worst
 
 
+def assert_projects(camera: Camera, formula: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Assert that a camera projects points before it to the pixels (N, 2) that a formula gives for points (N, 3)."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.5, 0.5, (200, 2)), np.ones(200)]) * rng.uniform(1, 9, (200, 1))
+    pixels, valid = camera.project(points)
+    assert valid.all()
+    np.testing.assert_allclose(pixels, formula(points), rtol=0, atol=1e-9)
+
+
 def assert_same(capture: Capture, other: Capture, *, pose_tolerance: float = 0.0) -> None:
     """Assert that all parts of two captures agree exactly, and poses within a tolerance."""
     assert len(capture.frames) == len(other.frames)
@@ -126,3 +138,12 @@ def assert_same(capture: Capture, other: Capture, *, pose_tolerance: float = 0.0
         np.testing.assert_array_equal(other.observations.frame_index, capture.observations.frame_index)
         np.testing.assert_array_equal(other.observations.point_index, capture.observations.point_index)
         np.testing.assert_array_equal(other.observations.pixels, capture.observations.pixels)
+
+
+@contextmanager
+def refused(what: str, path: Path) -> Iterator[None]:
+    """Assert that a block refuses its input with a message that names the file and matches a pattern."""
+    with pytest.raises(UserError, match=what) as caught:
+        yield
+    assert caught.value.exit_code == BAD_INPUT
+    assert str(path) in caught.value.message

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import put_photos
+from captures import put_photos, refused
 from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
@@ -13,7 +13,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.bundler import find_bundler, parse_bundler
 from nerfcli.captures.formats.format import UserInputs
-from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.errors import UserError
 
 LENSES = [(60.0, 0.1, -0.05), (55.0, 0.02, 0.0), (50.0, 0.0, 0.0)]
 NAMES = ["a.jpg", "b c.jpg", "ü.jpg"]
@@ -171,7 +171,5 @@ def edited(number: int, line: str | None) -> str:
 )
 def test_malformed_files_are_refused_with_file_and_line(tmp_path, text, names, what):
     path = write(tmp_path, text, names)
-    with pytest.raises(UserError, match=what) as caught:
+    with refused(what, tmp_path):
         parse(path)
-    assert caught.value.exit_code == BAD_INPUT
-    assert str(tmp_path) in caught.value.message

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from captures import refused
 from every_format import WITH_PHOTOS, Views, change_json, matrix_text, parse, text
 from scipy.spatial.transform import Rotation
 
@@ -12,7 +13,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.registry import recognise
-from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.errors import UserError
 
 SIZE = (64, 48)
 CAMERA = Camera("PINHOLE", *SIZE, (70.0, 71.5, 30.25, 25.5))
@@ -130,10 +131,8 @@ class TestPoseFiles:
     def test_intrinsics_that_are_none_are_refused(self, tmp_path, content, what):
         write("pose-files", tmp_path)
         path = text(tmp_path / "intrinsic/intrinsic_color.txt", content)
-        with pytest.raises(UserError, match=what) as caught:
+        with refused(what, path):
             parse(tmp_path)
-        assert caught.value.exit_code == BAD_INPUT
-        assert str(path) in caught.value.message
 
 
 class TestMvsnet:

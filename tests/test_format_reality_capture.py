@@ -4,13 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import put_photos
+from captures import put_photos, refused
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.reality_capture import TABLE, parse_reality_capture
-from nerfcli.errors import BAD_INPUT, UserError
 
 OLD = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"
 NEW = "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2"
@@ -134,7 +133,5 @@ def test_names_photos_and_a_line_before_the_header(tmp_path):
 def test_malformed_files_are_refused_with_file_and_line(tmp_path, rows, header, what):
     put_photos(tmp_path, "a.jpg", "b.jpg")
     path = write(tmp_path, *rows, header=header)
-    with pytest.raises(UserError, match=what) as caught:
+    with refused(what, path):
         TABLE.parse(path)
-    assert caught.value.exit_code == BAD_INPUT
-    assert str(path) in caught.value.message

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from captures import refused
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
@@ -11,7 +12,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.trajectories import KITTI, TUM, losses_kitti, losses_tum, write_tum
-from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.errors import UserError
 
 CAMERA = Camera("OPENCV", 640, 480, (500, 510, 331, 236, 0.1, -0.05, 0.001, 0.002))
 HALF = 0.5**0.5
@@ -108,7 +109,5 @@ def test_without_a_camera_the_message_requests_one(tmp_path, kind):
 def test_malformed_files_are_refused_with_file_and_line(tmp_path, kind, text, what):
     path = tmp_path / "poses.txt"
     path.write_text(text)
-    with pytest.raises(UserError, match=what) as caught:
+    with refused(what, path):
         FORMATS[kind].parse(path, UserInputs(camera=CAMERA))
-    assert caught.value.exit_code == BAD_INPUT
-    assert str(path) in caught.value.message

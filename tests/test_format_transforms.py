@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from captures import CAMERAS, assert_same, photograph, put_photos, reprojection_px, ring, with_photos
+from captures import CAMERAS, assert_same, photograph, put_photos, refused, reprojection_px, ring, with_photos
 from scipy.spatial.transform import Rotation
 
 from nerfcli.atomic import write_json
@@ -20,7 +20,7 @@ from nerfcli.captures.formats.blender import losses_blender, parse_blender, writ
 from nerfcli.captures.formats.transforms import losses_transforms, parse_transforms, write_transforms
 from nerfcli.captures.formats.transforms_cameras import lost_to_transforms
 from nerfcli.captures.loading import load_scene
-from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.errors import UserError
 
 LOST = {
     "FULL_OPENCV": ("k4", "k5", "k6"),
@@ -140,10 +140,8 @@ def test_rounded_poses_become_exactly_rigid(tmp_path):
 def test_malformed_transforms_are_refused_with_file_and_field(tmp_path, change, what):
     put_photos(tmp_path, "a.png")
     path = transforms_of(tmp_path, **SHARED | {"frames": [entry("a.png")]} | change)
-    with pytest.raises(UserError, match=what) as caught:
+    with refused(what, tmp_path):
         load_scene(path)
-    assert caught.value.exit_code == BAD_INPUT
-    assert str(tmp_path) in caught.value.message
 
 
 @pytest.mark.parametrize(
