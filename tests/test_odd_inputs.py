@@ -5,6 +5,7 @@ says which photo was found.
 """
 
 import json
+import re
 import shutil
 import struct
 import unicodedata
@@ -17,8 +18,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from captures import ring
-from commands import completed, error_of, nerfcli, refusal
+from captures import put_photos, ring
+from commands import completed, nerfcli, refusal
 from every_format import WITH_PHOTOS, Views, numbers, parse, replace_in
 from PIL import Image
 from views import PINHOLE, capture_of
@@ -32,7 +33,7 @@ from nerfcli.captures.formats.lenses import Fits, Terms
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.formats.ply import write_points
 from nerfcli.captures.formats.registry import with_masks
-from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.errors import UserError
 
 CAPTURE = capture_of([PINHOLE])
 COUNT = len(CAPTURE.frames)
@@ -44,14 +45,6 @@ def photos(folder: Path, names: Sequence[str], *, size: tuple[int, int] = SIZE) 
     for index, name in enumerate(names):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         Image.new("L", size, 10 * index).save(folder / name)
-
-
-def with_orientation(path: Path, orientation: int) -> None:
-    """Write an EXIF orientation to a photo."""
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    with Image.open(path) as picture:
-        picture.save(path, exif=exif)
 
 
 def levels(found: Sequence[Path | None]) -> list[int | None]:
@@ -72,8 +65,8 @@ def transforms_record(names: Sequence[str], **more: Any) -> dict[str, Any]:
     return {**head, "frames": frames, **more}
 
 
-def transforms(folder: Path, names: Sequence[str]) -> None:
-    (folder / "transforms.json").write_text(json.dumps(transforms_record(names)))
+def transforms(folder: Path, names: Sequence[str], **more: Any) -> None:
+    (folder / "transforms.json").write_text(json.dumps(transforms_record(names, **more)))
 
 
 def numbered(pattern: str) -> list[str]:
@@ -241,23 +234,20 @@ def test_a_conversion_refuses_cameras_of_another_shape_than_their_photos(write, 
     assert nerfcli("convert", tmp_path, tmp_path / "out.txt", "--to", "tum", "--allow-loss").exit_code == 0
     photos(tmp_path / "images", numbered("{}.png"))
     (tmp_path / "images/0.png").write_bytes(b"")
-    with_orientation(tmp_path / "images/1.png", 2)
+    put_photos(tmp_path, "images/1.png", size=SIZE, orientation=2)
     completed("convert", tmp_path, tmp_path / "out.json", "--to", "transforms", "--allow-loss")
 
 
 def test_a_panorama_with_an_orientation_is_converted_as_stored_and_not_turned(tmp_path):
     photos(tmp_path, numbered("images/{}.png"), size=(128, 64))
-    with_orientation(tmp_path / "images/1.png", 3)
-    sphere = {"camera_model": "EQUIRECTANGULAR", "w": 128, "h": 64}
-    content = transforms_record(numbered("images/{}.png"), **sphere)
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    put_photos(tmp_path, "images/1.png", size=(128, 64), orientation=3)
+    transforms(tmp_path, numbered("images/{}.png"), camera_model="EQUIRECTANGULAR", w=128, h=64)
     completed("convert", tmp_path, tmp_path / "out", "--to", "colmap")
     error, _ = refusal("convert", tmp_path, tmp_path / "scene", "--to", "nerfcli")
     assert "images/1.png: a spherical picture with EXIF orientation 3" in error
     photos(tmp_path, ["images/0.png", "images/1.png"], size=(128, 64))
     assert nerfcli("convert", tmp_path, tmp_path / "scene", "--to", "nerfcli").exit_code == 0
-    photos(tmp_path, ["images/1.png"], size=(64, 128))
-    with_orientation(tmp_path / "images/1.png", 6)
+    put_photos(tmp_path, "images/1.png", size=(64, 128), orientation=6)
     error, _ = refusal("convert", tmp_path / "scene", tmp_path / "out.json", "--to", "transforms")
     assert "images/1.png: a spherical picture with EXIF orientation 6" in error
 
@@ -320,22 +310,13 @@ def assert_centres(capture: Capture, expected: np.ndarray) -> None:
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-12)
 
 
-def lose_record3d(folder: Path) -> None:
-    content = json.loads((folder / "metadata.json").read_text())
-    content["poses"][LOST][:4] = [0.0] * 4
-    (folder / "metadata.json").write_text(json.dumps(content))
-
-
-def lose_transforms(folder: Path) -> None:
-    content = json.loads((folder / "transforms.json").read_text())
-    content["frames"][LOST]["transform_matrix"] = None
-    (folder / "transforms.json").write_text(json.dumps(content))
-
-
-def lose_opensfm(folder: Path) -> None:
-    content = json.loads((folder / "reconstruction.json").read_text())
-    content[0]["shots"]["2.jpg"]["rotation"] = [float("nan")] * 3
-    (folder / "reconstruction.json").write_text(json.dumps(content))
+def lose_in_json(file: str, keys: Sequence[Any], value: Any, folder: Path) -> None:
+    """Change one value in a JSON file."""
+    content = part = json.loads((folder / file).read_text())
+    for key in keys[:-1]:
+        part = part[key]
+    part[keys[-1]] = value
+    (folder / file).write_text(json.dumps(content))
 
 
 def lose_llff(folder: Path) -> None:
@@ -344,41 +325,25 @@ def lose_llff(folder: Path) -> None:
     np.save(folder / "poses_bounds.npy", rows)
 
 
-def lose_colmap_text(folder: Path) -> None:
-    lines = (folder / "sparse/0/images.txt").read_text().splitlines()
-    row = next(index for index, line in enumerate(lines) if line.endswith(" 2.jpg"))
-    words = lines[row].split()
-    lines[row] = " ".join([words[0], *["nan"] * 7, *words[8:]])
-    (folder / "sparse/0/images.txt").write_text("\n".join(lines) + "\n")
-
-
-def lose_reality_capture(folder: Path) -> None:
-    path = next(folder.glob("*.csv"))
-    lines = path.read_text().splitlines()
-    row = next(index for index, line in enumerate(lines) if line.startswith("images/2."))
-    words = lines[row].split(",")
-    lines[row] = ",".join([words[0], *["-nan(ind)"] * 3, *words[4:]])
-    path.write_text("\n".join(lines) + "\n")
-
-
-def lose_row(file: str, folder: Path) -> None:
-    """Make the numbers of the third row of a table unknown, but for those that say which photo it is."""
+def lose_in_row(file: str, row: str, separator: str, cells: slice, folder: Path, *, unknown: str = "nan") -> None:
+    """Make some cells unknown in the row of a table that matches a pattern."""
     lines = (folder / file).read_text().splitlines()
-    row = next(index for index, line in enumerate(lines) if not line.startswith(("#", "timestamp"))) + LOST
-    cells = lines[row].split(",")
-    lines[row] = ", ".join([*cells[:2], *["nan"] * len(cells[2:])])
+    (index,) = (index for index, line in enumerate(lines) if re.search(row, line))
+    words = lines[index].split(separator)
+    words[cells] = [unknown] * len(words[cells])
+    lines[index] = separator.join(words)
     (folder / file).write_text("\n".join(lines) + "\n")
 
 
 LOSE = {
-    "kapture": partial(lose_row, "sensors/trajectories.txt"),
-    "stray-scanner": partial(lose_row, "odometry.csv"),
-    "record3d": lose_record3d,
-    "transforms": lose_transforms,
-    "opensfm": lose_opensfm,
+    "kapture": partial(lose_in_row, "sensors/trajectories.txt", "^0002,", ", ", slice(2, None)),
+    "stray-scanner": partial(lose_in_row, "odometry.csv", ", 000002,", ", ", slice(2, None)),
+    "record3d": partial(lose_in_json, "metadata.json", ("poses", LOST, slice(4)), [0.0] * 4),
+    "transforms": partial(lose_in_json, "transforms.json", ("frames", LOST, "transform_matrix"), None),
+    "opensfm": partial(lose_in_json, "reconstruction.json", (0, "shots", "2.jpg", "rotation"), [float("nan")] * 3),
     "llff": lose_llff,
-    "colmap-text": lose_colmap_text,
-    "reality-capture": lose_reality_capture,
+    "colmap-text": partial(lose_in_row, "sparse/0/images.txt", " 2.jpg$", " ", slice(1, 8)),
+    "reality-capture": partial(lose_in_row, "cameras.csv", "^images/2.", ",", slice(1, 4), unknown="-nan(ind)"),
 }
 
 
@@ -397,7 +362,7 @@ def test_a_frame_without_a_pose_is_left_out_and_named(form, tmp_path):
 
 
 def test_a_capture_whose_only_photo_has_no_pose_is_refused(tmp_path):
-    lose_record3d(put("record3d", tmp_path))
+    LOSE["record3d"](put("record3d", tmp_path))
     for photo in tmp_path.rglob("*.jpg"):
         if photo.stem != str(LOST):
             photo.unlink()
@@ -687,15 +652,19 @@ def test_a_lens_of_a_later_colmap_is_named_with_what_supports_it(tmp_path):
     assert "EQUIRECTANGULAR" in caught.value.hint
 
 
+def put_sphere(form: str, folder: Path, *, height: int) -> None:
+    """Put ordinary photos, of 640x480, and spherical cameras of 640 columns."""
+    photos(folder / "images", numbered("{}.png"))
+    if form == "transforms":
+        transforms(folder, numbered("images/{}.png"), camera_model="equirectangular", w=640, h=height)
+    else:
+        colmap(folder, numbered("{}.png"))
+        (folder / "sparse/0/cameras.txt").write_text(f"1 EQUIRECTANGULAR 640 {height} 640 {height}\n")
+
+
 @pytest.mark.parametrize("form", ["transforms", "colmap"])
 def test_a_sphere_that_is_not_two_to_one_is_refused(form, tmp_path):
-    photos(tmp_path / "images", numbered("{}.png"))
-    if form == "transforms":
-        content = transforms_record(numbered("images/{}.png"), camera_model="equirectangular")
-        (tmp_path / "transforms.json").write_text(json.dumps(content))
-    else:
-        colmap(tmp_path, numbered("{}.png"))
-        (tmp_path / "sparse/0/cameras.txt").write_text("1 EQUIRECTANGULAR 640 480 640 480\n")
+    put_sphere(form, tmp_path, height=480)
     with pytest.raises(UserError, match="EQUIRECTANGULAR picture: 640x480") as caught:
         parse(tmp_path)
     assert "twice as wide as high" in caught.value.hint
@@ -703,18 +672,11 @@ def test_a_sphere_that_is_not_two_to_one_is_refused(form, tmp_path):
 
 @pytest.mark.parametrize("form", ["transforms", "colmap"])
 def test_ordinary_photos_of_a_spherical_camera_are_refused(form, tmp_path):
-    photos(tmp_path / "images", numbered("{}.png"))
-    if form == "transforms":
-        content = transforms_record(numbered("images/{}.png"), camera_model="equirectangular", w=640, h=320)
-        (tmp_path / "transforms.json").write_text(json.dumps(content))
-    else:
-        colmap(tmp_path, numbered("{}.png"))
-        (tmp_path / "sparse/0/cameras.txt").write_text("1 EQUIRECTANGULAR 640 320 640 320\n")
+    put_sphere(form, tmp_path, height=320)
     for command in (["convert", tmp_path, tmp_path / "out.json", "--to", "transforms"], ["info", tmp_path]):
-        refused = nerfcli(*command)
-        assert refused.exit_code == BAD_INPUT
-        assert "0.png: a picture of 640x480 pixels does not match a camera of 640x320" in error_of(refused)[0]
-        assert "twice as wide as high" in refused.stderr
+        error, hint = refusal(*command)
+        assert "0.png: a picture of 640x480 pixels does not match a camera of 640x320" in error
+        assert "twice as wide as high" in hint
 
 
 # Lenses
