@@ -253,29 +253,23 @@ def test_srgb_and_broken_and_foreign_profiles_leave_the_pixels_alone(tmp_path):
         np.testing.assert_array_equal(read_image(path), pixels, err_msg=name)
 
 
-def jpeg_bytes() -> bytes:
+def encoded(kind: str, *, side: int = 64, **options: Any) -> bytes:
     buffer = io.BytesIO()
-    Image.fromarray(noise(64, 64, 3)).save(buffer, "JPEG")
+    Image.fromarray(noise(side, side, 3)).save(buffer, kind, **options)
     return buffer.getvalue()
 
 
 def test_unreadable_files_are_reported_by_name(tmp_path):
-    jpeg = jpeg_bytes()
-    png = io.BytesIO()
-    Image.fromarray(noise(64, 64, 3)).save(png, "PNG")
-    tiff = io.BytesIO()
-    Image.fromarray(noise(64, 64, 3)).save(tiff, "TIFF")
-    webp = io.BytesIO()
-    Image.fromarray(noise(64, 64, 3)).save(webp, "WEBP")
+    jpeg, png, tiff, webp = (encoded(kind) for kind in ("JPEG", "PNG", "TIFF", "WEBP"))
     contents = {
         "zero.jpg": (b"", "is empty \\(0 bytes\\)"),
         "text.jpg": (b"this is no photo\n" * 20, "is not a readable picture"),
-        "head.png": (png.getvalue()[:12], "is not a readable picture"),
+        "head.png": (png[:12], "is not a readable picture"),
         "cut.jpg": (jpeg[: len(jpeg) // 2], "is damaged or truncated"),
-        "cut.png": (png.getvalue()[:3000], "is damaged or truncated"),
-        "cut.tif": (tiff.getvalue()[:3000], "is damaged or truncated|is not a readable picture"),
-        "cut.webp": (webp.getvalue()[:2000], "is damaged or truncated|is not a readable picture"),
-        "flipped.png": (png.getvalue()[:100] + b"\0" * 500 + png.getvalue()[600:], "is damaged or truncated"),
+        "cut.png": (png[:3000], "is damaged or truncated"),
+        "cut.tif": (tiff[:3000], "is damaged or truncated|is not a readable picture"),
+        "cut.webp": (webp[:2000], "is damaged or truncated|is not a readable picture"),
+        "flipped.png": (png[:100] + b"\0" * 500 + png[600:], "is damaged or truncated"),
         "größe 1.jpg": (b"\xff\xd8\xff\xe0", "is not a readable picture"),
     }
     for name, (content, message) in contents.items():
@@ -299,9 +293,7 @@ def test_a_photo_with_any_byte_changed_is_read_or_refused(data, tmp_path_factory
     exif = exif_with(
         {ExifTags.Base.Make: "Maker"}, {ExifTags.IFD.Exif: {ExifTags.Base.FocalLength: IFDRational(35, 2)}}
     )
-    buffer = io.BytesIO()
-    Image.fromarray(noise(8, 8, 3)).save(buffer, kind, exif=exif)
-    content = bytearray(buffer.getvalue())
+    content = bytearray(encoded(kind, side=8, exif=exif))
     for _ in range(data.draw(st.integers(1, 4))):
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     path = tmp_path_factory.getbasetemp() / "changed"
