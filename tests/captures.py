@@ -80,13 +80,16 @@ def photograph(frames: Sequence[Frame]) -> None:
         Image.new("L", frame.camera.size).save(frame.image)
 
 
-def put_photos(folder: Path, *names: str, size: tuple[int, int] = (64, 48), orientation: int = 1) -> None:
-    """Put pictures of a size as it is stored and of an EXIF orientation into a folder."""
+def put_photos(
+    folder: Path, *names: str, size: tuple[int, int] = (64, 48), orientation: int = 1, noise: bool = False
+) -> None:
+    """Put pictures of a size as it is stored and of an EXIF orientation into a folder: black, or each its own noise."""
     exif = Image.Exif()
     exif[0x0112] = orientation
-    for path in (folder / name for name in names):
+    for seed, path in enumerate(folder / name for name in names):
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.new("L", size).save(path, exif=exif)
+        levels = np.random.default_rng(seed).integers(0, 256 if noise else 1, (*size[::-1], 3), dtype=np.uint8)
+        Image.fromarray(levels).save(path, exif=exif)
 
 
 def with_photos(capture: Capture, folder: Path) -> Capture:

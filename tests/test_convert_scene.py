@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from captures import reprojection_px
+from captures import put_photos, reprojection_px, with_photos
 from commands import completed, error_of, listing, nerfcli, refusal
 from PIL import Image
 from test_convert import LIMIT_PX, model_of
@@ -37,15 +37,9 @@ TURNS = {1: None, 3: cv2.ROTATE_180, 6: cv2.ROTATE_90_CLOCKWISE, 8: cv2.ROTATE_9
 
 def photographed(capture: Capture, folder: Path, orientations: dict[int, int] | None = None) -> Capture:
     """Return the capture with photos on disk, some with an EXIF orientation; the cameras are for stored pixels."""
-    frames = []
     for index, frame in enumerate(capture.frames):
-        exif = Image.Exif()
-        exif[0x0112] = (orientations or {}).get(index, 1)
-        path = folder / frame.name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.new("RGB", (frame.camera.width, frame.camera.height)).save(path, exif=exif)
-        frames.append(replace(frame, image=path))
-    return replace(capture, frames=tuple(frames))
+        put_photos(folder, frame.name, size=frame.camera.size, orientation=(orientations or {}).get(index, 1))
+    return with_photos(capture, folder)
 
 
 def masked(capture: Capture, folder: Path, *indices: int) -> Capture:

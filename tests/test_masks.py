@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from captures import put_photos
 from PIL import Image
 from synthetic_captures import job_of
 
@@ -24,20 +25,9 @@ from nerfcli.poses.structure_from_motion import plan_poses
 WIDTH, HEIGHT = 120, 80
 
 
-def write_photo(path: Path, *, orientation: int = 1, size: tuple[int, int] = (WIDTH, HEIGHT), seed: int = 0) -> Path:
-    """Write a photo of noise, stored with an EXIF orientation."""
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    noise = np.random.default_rng(seed).integers(0, 255, (*size[::-1], 3), dtype=np.uint8)
-    path.parent.mkdir(exist_ok=True)
-    Image.fromarray(noise).resize(size, Image.Resampling.BICUBIC).save(path, exif=exif)
-    return path
-
-
 @pytest.fixture
 def photos(tmp_path) -> Photos:
-    for index in range(4):
-        write_photo(tmp_path / "photos" / f"p {index}.png", seed=index)
+    put_photos(tmp_path / "photos", *(f"p {index}.png" for index in range(4)), size=(WIDTH, HEIGHT), noise=True)
     return find_photos(tmp_path / "photos")
 
 
@@ -93,7 +83,8 @@ def test_a_mask_is_found_by_the_end_of_its_photos_path_and_is_never_the_photo(ma
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_mask_as_the_photo_is_stored_turns_with_it(tmp_path, orientation):
     """Evidence: the photo itself, thresholded as stored and as turned by Pillow's transposition."""
-    photo = write_photo(tmp_path / "p.png", orientation=orientation)
+    photo = tmp_path / "p.png"
+    put_photos(tmp_path, photo.name, size=(WIDTH, HEIGHT), orientation=orientation, noise=True)
     stored = np.asarray(Image.open(photo).convert("L")) > 127
     write_png(tmp_path / "upright.png", (read_image(photo).mean(-1) > 99).astype(np.uint8) * 255)
     np.testing.assert_array_equal(read_mask(tmp_path / "upright.png", photo) > 0, read_image(photo).mean(-1) > 99)
@@ -105,7 +96,8 @@ def test_a_mask_as_the_photo_is_stored_turns_with_it(tmp_path, orientation):
 
 def test_levels_of_a_mask(tmp_path):
     """White may be 255 or 1; grey edges stay; what JPEG leaves around an edge does not."""
-    photo = write_photo(tmp_path / "p.png")
+    photo = tmp_path / "p.png"
+    put_photos(tmp_path, photo.name, size=(WIDTH, HEIGHT))
     half = np.zeros((HEIGHT, WIDTH), np.uint8)
     half[:, WIDTH // 2 :] = 1
     write_png(tmp_path / "one.png", half)

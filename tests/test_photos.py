@@ -5,11 +5,9 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
-from PIL import Image
+from captures import put_photos
 
 from nerfcli.doctor.examination import find_subject
 from nerfcli.errors import UserError
@@ -17,27 +15,15 @@ from nerfcli.photos.exif import Exif
 from nerfcli.poses.input.photos import Photo, camera_groups, find_photos
 from nerfcli.poses.model.reasons import NO_TRAINING_PHOTO, dominant, reason
 
-_ABSENT = ("make", "model", "lens", "focal_mm", "focal_35mm", "exposure_seconds", "iso", "gps")
-_UNKNOWN: dict[str, Any] = dict.fromkeys(_ABSENT)
-NO_EXIF = Exif(orientation=1, width=64, height=48, **_UNKNOWN)
-
-
-def save_photo(path: Path, *, seed: int = 0, size: tuple[int, int] = (64, 48), orientation: int = 1) -> None:
-    """A picture of noise, `size` as stored."""
-    pixels = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    Image.fromarray(pixels).save(path, quality=90, exif=exif)
+NO_EXIF = Exif(64, 48)
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Five good photos; b.jpg is stored lying on its side."""
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for seed, name in enumerate("abcde"):
-        save_photo(folder / f"{name}.jpg", seed=seed, orientation=6 if name == "b" else 1)
-    return folder
+    put_photos(tmp_path / "photos", "a.jpg", "c.jpg", "d.jpg", "e.jpg", noise=True)
+    put_photos(tmp_path / "photos", "b.jpg", orientation=6, noise=True)
+    return tmp_path / "photos"
 
 
 def test_photos_are_sorted_and_upright(folder: Path):

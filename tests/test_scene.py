@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from captures import put_photos
 from every_format import change_json
-from PIL import Image
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
@@ -20,13 +20,6 @@ from nerfcli.captures.loading import fingerprint, load_scene
 from nerfcli.errors import BAD_INPUT, UserError
 
 NAMES = [f"photo {index:02d}.jpg" for index in range(10)]
-
-
-def write_image(path: Path, *, size: tuple[int, int] = (64, 48), orientation: int = 1) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    Image.new("RGB", size).save(path, exif=exif)
 
 
 def write_transforms(folder: Path, names: list[str], *, file: str = "transforms.json") -> None:
@@ -56,8 +49,7 @@ def model(tmp_path_factory) -> Path:
 @pytest.fixture
 def own(tmp_path, model) -> Path:
     """A scene as `nerfcli poses` leaves it: photos beside it, sparse/0 and scene.json in it."""
-    for name in NAMES:
-        write_image(tmp_path / "photos" / name)
+    put_photos(tmp_path / "photos", *NAMES)
     folder = tmp_path / "photos-scene"
     shutil.copytree(model, folder / "sparse/0")
     save(folder, image_folder=tmp_path / "photos", provenance={"command": "poses"})
@@ -65,9 +57,9 @@ def own(tmp_path, model) -> Path:
 
 
 def test_splits_that_nerfstudio_lists_are_kept(tmp_path):
-    for name in "abcd":
-        write_image(tmp_path / f"{name}.png")
-    write_transforms(tmp_path, [f"{name}.png" for name in "abcd"])
+    names = [f"{name}.png" for name in "abcd"]
+    put_photos(tmp_path, *names)
+    write_transforms(tmp_path, names)
     path = tmp_path / "transforms.json"
     change_json(path, train_filenames=["a.png", "b.png"], val_filenames=["c.png"])
     assert load_scene(tmp_path).test_names == {"c.png"}  # held out for want of a test split; d is not used
@@ -84,8 +76,7 @@ def test_colmap_project_wherever_its_model_stands(tmp_path, model, place):
         UserError, match=r"colmap \(a COLMAP model\), none of its 10 photos is on disk, such as photo 00"
     ):
         load_scene(tmp_path)
-    for name in NAMES[1:]:
-        write_image(tmp_path / "images" / name)
+    put_photos(tmp_path / "images", *NAMES[1:])
     scene = load_scene(tmp_path)
     assert scene.kind == "colmap"
     assert scene.missing == (NAMES[0],)
@@ -95,8 +86,7 @@ def test_colmap_project_wherever_its_model_stands(tmp_path, model, place):
 
 
 def test_a_converted_model_whose_names_begin_with_the_folder_of_the_photos(tmp_path):
-    for name in NAMES:
-        write_image(tmp_path / "images" / name)
+    put_photos(tmp_path / "images", *NAMES)
     write_transforms(tmp_path, [f"images/{name}" for name in NAMES])
     write_colmap_binary(parse_transforms(tmp_path / "transforms.json"), tmp_path / "sparse/0")
     scene = load_scene(tmp_path)
@@ -153,7 +143,7 @@ def test_what_is_no_scene_says_what_was_looked_for(tmp_path):
         load_scene(tmp_path)
     assert caught.value.exit_code == BAD_INPUT
     assert caught.value.hint.startswith("looked for scene.json, sparse/0/cameras.bin or .txt, transforms.json and ")
-    write_image(tmp_path / "images/a.JPG")
+    put_photos(tmp_path, "images/a.JPG")
     with pytest.raises(UserError, match=r"images has 1 photo but no cameras") as caught:
         load_scene(tmp_path)
     assert caught.value.hint == f"estimate them with: nerfcli poses {tmp_path / 'images'}"

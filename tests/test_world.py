@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from captures import put_photos
 from examples import examples
 from frame_rays import frame_rays
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
@@ -91,9 +91,7 @@ def test_up_points_along_the_axis_and_nothing_else_changes_size(seed, axis):
 
 def test_up_is_that_of_upright_photos_where_the_cameras_are_for_stored_pixels(tmp_path):
     """Regression: a capture of portrait photos was tipped by 90 degrees."""
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.new("L", (64, 48)).save(tmp_path / "portrait.jpg", exif=exif)
+    put_photos(tmp_path, "portrait.jpg", orientation=6)
     frames = [
         replace(frame, camera=Camera.pinhole(48, 64, 50.0), image=tmp_path / "portrait.jpg")
         for frame in capture_of(np.random.default_rng(0)).frames

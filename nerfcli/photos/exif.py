@@ -30,17 +30,17 @@ class Exif:
     `focal_evidence.with_digital_zoom`. pages: of the file, of which the largest is the photo.
     """
 
-    make: str | None
-    model: str | None
-    lens: str | None
-    focal_mm: float | None
-    focal_35mm: float | None
-    orientation: int
     width: int
     height: int
-    exposure_seconds: float | None
-    iso: float | None
-    gps: tuple[float, float, float | None] | None
+    orientation: int = 1
+    make: str | None = None
+    model: str | None = None
+    lens: str | None = None
+    focal_mm: float | None = None
+    focal_35mm: float | None = None
+    exposure_seconds: float | None = None
+    iso: float | None = None
+    gps: tuple[float, float, float | None] | None = None
     taken: float | None = None
     f_number: float | None = None
     taken_px: tuple[int, int] | None = None
