@@ -39,7 +39,6 @@ from nerfcli.errors import (
     in_shell,
 )
 from nerfcli.interrupts import install_handlers
-from nerfcli.output import Output
 from nerfcli.photos.images import read_image
 from nerfcli.photos.masks import write_masks
 from nerfcli.poses import structure_from_motion
@@ -65,6 +64,24 @@ PROJECT = Path(__file__).parent.parent
 GUIDES = (PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md")))
 # Enough for a command that trains to go through all of its stages.
 QUICK = ("--steps", "1", "--downscale", "8", "--log2-rows", "10", "--threads", "2")
+
+
+@pytest.fixture
+def stop_at(monkeypatch) -> Callable[..., list[tuple[tuple[Any, ...], dict[str, Any]]]]:
+    """Let functions end a command when it calls them, and return the list of their arguments."""
+
+    def stop_at(*names: str) -> list[tuple[tuple[Any, ...], dict[str, Any]]]:
+        calls = []
+
+        def stop(*given: Any, **more: Any) -> None:
+            calls.append((given, more))
+            raise UserError("enough", "of this test")
+
+        for name in names:
+            monkeypatch.setattr(f"nerfcli.{name}", stop)
+        return calls
+
+    return stop_at
 
 
 def write_photos(folder: Path, count: int) -> Path:
@@ -287,13 +304,8 @@ def test_photos_where_cameras_are_needed_are_reported_with_what_to_do(tmp_path):
 
 
 def test_paths_in_hints_can_be_typed():
-    assert [in_shell(Path(name)) for name in ("a/b", "-a", "-a b", "it's", "/a b")] == [
-        "a/b",
-        "./-a",
-        "'./-a b'",
-        """'it'"'"'s'""",
-        "'/a b'",
-    ]
+    typed = {"a/b": "a/b", "-a": "./-a", "-a b": "'./-a b'", "it's": """'it'"'"'s'""", "/a b": "'/a b'"}
+    assert {name: in_shell(Path(name)) for name in typed} == typed
 
 
 @pytest.mark.parametrize("command", ["poses", "run"])
@@ -387,25 +399,15 @@ def test_train_evaluate_render_info_in_a_row(capture):
     assert f"{metrics['mean']['psnr']:.2f} dB" in (run / "report.html").read_text(encoding="utf-8")
     both = nerfcli("report", run, run, "-o", run / "report.html")
     assert (both.exit_code, "is not a page of this report" in both.stderr) == (3, True)
-    result_json = json.loads(nerfcli("info", run, "--json").stdout)
-    assert (result_json["kind"], result_json["photos"], result_json["held_out"], result_json["step"]) == (
-        "run",
-        4,
-        1,
-        1,
-    )
-    assert result_json["metrics"] == metrics["mean"]
+    facts = json.loads(nerfcli("info", run, "--json").stdout)
+    assert [facts[name] for name in ("kind", "photos", "held_out", "step")] == ["run", 4, 1, 1]
+    assert facts["metrics"] == metrics["mean"]
 
 
 def test_info_of_a_scene(capture):
-    result_json = json.loads(nerfcli("info", capture, "--json").stdout)
-    assert (result_json["path"], result_json["kind"], result_json["photos"], result_json["held_out"]) == (
-        str(capture),
-        "blender",
-        5,
-        1,
-    )
-    assert result_json["fingerprint"] == fingerprint(load_scene(capture))
+    facts = json.loads(nerfcli("info", capture, "--json").stdout)
+    assert [facts[name] for name in ("path", "kind", "photos", "held_out")] == [str(capture), "blender", 5, 1]
+    assert facts["fingerprint"] == fingerprint(load_scene(capture))
     plain = nerfcli("info", capture).stdout
     assert plain.splitlines()[0] == str(capture)
     assert "  kind: blender" in plain
@@ -488,7 +490,7 @@ def test_many_inputs_share_one_output_folder(capture, tmp_path):
     assert result.stdout.splitlines() == [str(tmp_path / "runs" / "spheres-run")]
 
 
-def test_results_of_inputs_of_one_name_do_not_replace_each_other(monkeypatch, tmp_path):
+def test_results_of_inputs_of_one_name_do_not_replace_each_other(monkeypatch, stop_at, tmp_path):
     written = []
     monkeypatch.setattr(
         "nerfcli.workflows.export.export_run", lambda run, output, **more: written.append(output.path) or output.path
@@ -499,12 +501,7 @@ def test_results_of_inputs_of_one_name_do_not_replace_each_other(monkeypatch, tm
     assert written == [tmp_path / name for name in names]  # the last one is the same input again
     assert error_of(result)[0].endswith("is the result of a/kitchen, which has the same name")
 
-    def only_asked(*given: object, **more: object) -> None:
-        raise UserError("enough", "of this test")
-
-    monkeypatch.setattr("nerfcli.workflows.pipeline.run_pipeline", only_asked)
-    monkeypatch.setattr("nerfcli.workflows.convert.convert_capture", only_asked)
-    monkeypatch.setattr("nerfcli.ct.convert.convert_scan", only_asked)
+    stop_at("workflows.pipeline.run_pipeline", "workflows.convert.convert_capture", "ct.convert.convert_scan")
     for arguments in (
         ("run", "-", "-o", tmp_path),
         ("convert", "-", tmp_path, "--to", "tum"),
@@ -758,31 +755,19 @@ def test_photos_of_a_path_are_wrong_usage_for_other_views(finished):
 
 
 @pytest.mark.parametrize("is_archive", [False, True])
-def test_run_trains_a_capture_with_the_poses_that_it_has(monkeypatch, capture, is_archive):
-    trained = []
-
-    def only_asked(scene: Path, output: Output, *given: object, **more: object) -> None:
-        trained.append((scene, output.path))
-        raise UserError("enough", "of this test")
-
-    monkeypatch.setattr("nerfcli.workflows.pipeline.train_scene", only_asked)
+def test_run_trains_a_capture_with_the_poses_that_it_has(stop_at, capture, is_archive):
+    trained = stop_at("workflows.pipeline.train_scene")
     given = Path(shutil.make_archive(str(capture), "zip", capture)) if is_archive else capture
     result = nerfcli("run", given)
     assert error_of(result)[0] == "Error: enough"
     scene = capture.with_name("spheres-unpacked") if is_archive else capture
-    assert trained == [(scene, capture.with_name("spheres-run"))]
+    assert [(given[0], given[1].path) for given, _ in trained] == [(scene, capture.with_name("spheres-run"))]
     assert f"{given} has poses (" in result.stderr
     assert result.stdout == ""
 
 
-def test_run_holds_out_what_is_asked_of_a_capture_and_refuses_options_of_poses(monkeypatch, capture):
-    rules = []
-
-    def only_asked(*given: object, holdout: str | None, **more: object) -> None:
-        rules.append(holdout)
-        raise UserError("enough", "of this test")
-
-    monkeypatch.setattr("nerfcli.workflows.pipeline.train_scene", only_asked)
+def test_run_holds_out_what_is_asked_of_a_capture_and_refuses_options_of_poses(stop_at, capture):
+    trained = stop_at("workflows.pipeline.train_scene")
     for more in ((), ("--holdout", "block:0.15"), ("--holdout", "every:8")):
         nerfcli("run", capture, *more)
     for poses, holdout in (
@@ -793,24 +778,19 @@ def test_run_holds_out_what_is_asked_of_a_capture_and_refuses_options_of_poses(m
         with pytest.raises(UserError, match="enough"):
             pipeline.run_pipeline(capture, poses=poses, holdout=holdout)
     # Regression: what is usual without poses was ignored, and from Python what `poses` says.
-    assert rules == [None, "block:0.15", "every:8", "block:0.15", "every:8", None]
+    rules = [None, "block:0.15", "every:8", "block:0.15", "every:8", None]
+    assert [more["holdout"] for _, more in trained] == rules
     for more in (("--frames", "9"), ("--quality", "best"), ("--subfolders",)):
         assert "has poses, which are used" in refusal("run", capture, *more, exit_code=2)[0]
 
 
-def test_run_holds_out_what_is_asked_of_photos(monkeypatch, capture):
-    rules = []
-
-    def only_asked(photos: Path, output: Output, poses: PoseSettings, **more: object) -> None:
-        rules.append(poses.holdout)
-        raise UserError("enough", "of this test")
-
-    monkeypatch.setattr(pipeline, "estimate_poses", only_asked)
+def test_run_holds_out_what_is_asked_of_photos(stop_at, capture):
+    estimated = stop_at("workflows.pipeline.estimate_poses")
     in_poses = PoseSettings(holdout="block:0.15")
     for settings_of_poses, holdout in ((in_poses, None), (in_poses, "block:0.2"), (PoseSettings(), None)):
         with pytest.raises(UserError, match="enough"):
             pipeline.run_pipeline(capture / "train", poses=settings_of_poses, holdout=holdout)
-    assert rules == ["block:0.15", "block:0.2", "every:8"]
+    assert [given[2].holdout for given, _ in estimated] == ["block:0.15", "block:0.2", "every:8"]
 
 
 def test_run_makes_no_splats_of_panoramas(monkeypatch, capture, tmp_path):
