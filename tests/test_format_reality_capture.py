@@ -13,17 +13,8 @@ from nerfcli.captures.formats.reality_capture import TABLE, parse_reality_captur
 
 OLD = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"
 NEW = "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2"
-LENS = {
-    "f": 28.5,
-    "px": 0.013,
-    "py": -0.0071,
-    "k1": 0.11,
-    "k2": -0.05,
-    "k3": 0.012,
-    "k4": 0,
-    "t1": 0.0011,
-    "t2": -0.0023,
-}
+RADIAL = {"k1": 0.11, "k2": -0.05, "k3": 0.012, "k4": 0}
+LENS = {"f": 28.5, "px": 0.013, "py": -0.0071, **RADIAL, "t1": 0.0011, "t2": -0.0023}
 SIZES = {"wide": (64, 48), "tall": (48, 64)}
 
 

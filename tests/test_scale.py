@@ -163,14 +163,8 @@ def test_local_metres_are_arcs_of_the_ellipsoid(latitude, longitude, seed):
     meridian = a * (1 - e2) / (1 - e2 * sine**2) ** 1.5
     normal = a / np.sqrt(1 - e2 * sine**2)
     step = 1e-5
-    enu = east_north_up(
-        [
-            (latitude, longitude, 100.0),
-            (latitude + step, longitude, 100.0),
-            (latitude, longitude + step, 100.0),
-            (latitude, longitude, 107.0),
-        ]
-    )
+    beside = [(latitude + step, longitude, 100.0), (latitude, longitude + step, 100.0)]
+    enu = east_north_up([(latitude, longitude, 100.0), *beside, (latitude, longitude, 107.0)])
     north = np.radians(step) * (meridian + 100)
     east = np.radians(step) * (normal + 100) * np.cos(np.radians(latitude))
     np.testing.assert_allclose(enu, [[0, 0, 0], [0, north, 0], [east, 0, 0], [0, 0, 7]], rtol=0, atol=2e-6)
@@ -553,15 +547,9 @@ def test_positions_in_exif_give_the_scale(tmp_path):
     frames = []
     for i, (east, north) in enumerate([(0, 0), (11, 0), (22, 0), (0, 11), (11, 11), (22, 11), (0, 22), (22, 22)]):
         exif = Image.Exif()
-        seconds = (3600 * north / 111194.0, 3600 * east / 74629.0)  # metres per degree there
-        exif[ExifTags.IFD.GPSInfo] = {
-            1: "N",
-            2: (48, 0, seconds[0]),
-            3: "E",
-            4: (11, 0, seconds[1]),
-            5: b"\0",
-            6: 500.0,
-        }
+        # With the metres of a degree there.
+        latitude, longitude = (48, 0, 3600 * north / 111194.0), (11, 0, 3600 * east / 74629.0)
+        exif[ExifTags.IFD.GPSInfo] = {1: "N", 2: latitude, 3: "E", 4: longitude, 5: b"\0", 6: 500.0}
         path = tmp_path / f"{i}.jpg"
         Image.new("RGB", (64, 48)).save(path, exif=exif)
         pose = rigid.from_parts(np.diag([1.0, -1, -1]), np.array([north, -east, 3.0]) / 10)
