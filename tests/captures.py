@@ -48,11 +48,18 @@ CAMERAS = {
 }
 
 
-def ring(*cameras: Camera, num_frames: int = 6, num_points: int = 40, seed: int = 0) -> Capture:
+def ring(
+    *cameras: Camera,
+    num_frames: int = 6,
+    num_points: int = 40,
+    seed: int = 0,
+    num_loose: int = 2,
+    name: str = "my photos/ä {:02d}.jpg",
+) -> Capture:
     """Return frames around a cloud of coloured points near the origin, with everything that a COLMAP model holds.
 
     Frames cycle through the cameras. Every point that a frame sees is observed at its projection, and each frame has
-    two features without a point. Names contain spaces and non-ASCII letters.
+    some features without a point. Names contain spaces and non-ASCII letters.
     """
     rng = np.random.default_rng(seed)
     points = rng.uniform(-0.7, 0.7, size=(num_points, 3))
@@ -62,11 +69,11 @@ def ring(*cameras: Camera, num_frames: int = 6, num_points: int = 40, seed: int 
         centre = np.array([3 * np.cos(angle), 3 * np.sin(angle), rng.uniform(0.2, 1.0)])
         pose = rigid.look_at(centre, rng.normal(scale=0.1, size=3), np.array([0.0, 0.0, 1.0]))
         camera = cameras[index % len(cameras)]
-        frames.append(Frame(f"my photos/ä {index:02d}.jpg", camera, pose))
+        frames.append(Frame(name.format(index), camera, pose))
         projected, valid = camera.project(rigid.apply(rigid.inverse(pose), points))
-        frame_index += [index] * (int(valid.sum()) + 2)
-        point_index += [*np.flatnonzero(valid), -1, -1]
-        pixels += [*projected[valid], *rng.uniform(0, 300, size=(2, 2))]
+        frame_index += [index] * (int(valid.sum()) + num_loose)
+        point_index += [*np.flatnonzero(valid), *[-1] * num_loose]
+        pixels += [*projected[valid], *rng.uniform(0, 300, size=(num_loose, 2))]
     observations = Observations(np.array(frame_index), np.array(point_index), np.array(pixels).reshape(-1, 2))
     colours = rng.integers(1, 256, size=(num_points, 3), dtype=np.uint8)
     return Capture(tuple(frames), points, (), None, "colmap", colours=colours, observations=observations)
