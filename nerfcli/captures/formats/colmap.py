@@ -21,11 +21,12 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import colmap_binary, colmap_text
 from nerfcli.captures.formats.colmap_model import ColmapImage, ColmapModel, capture_of, model_of
-from nerfcli.captures.formats.fields import opened
+from nerfcli.captures.formats.fields import malformed, opened
 from nerfcli.captures.formats.format import Format, UserInputs
+from nerfcli.captures.formats.limits import largest_of
 from nerfcli.captures.formats.photo_names import with_photos
 from nerfcli.captures.formats.unsupported import lost_parts
-from nerfcli.errors import UserError, several
+from nerfcli.errors import UserError
 
 FILES = ("cameras", "images", "points3D")
 # Models are replaced as a whole: new files would be wrong together with remaining files of another model.
@@ -67,15 +68,8 @@ def parse_model(model_dir: Path, given: UserInputs = UserInputs()) -> Capture:
     """
     capture = with_photos(parse_colmap(model_dir), model_dir, *model_dir.resolve().parents[:3], given=given.images)
     home = model_dir.parent if model_dir.name.isdecimal() else model_dir
-    others = [model for model in _models_in(home) if not model.samefile(model_dir)]
-    if not others:
-        return capture
-    counts = ", ".join(f"{_seen(model)} with {num_images(model)}" for model in others)
-    note = (
-        f"{_seen(model_dir)} with {several(len(capture.frames), 'photo')} is read; other models, which are in other "
-        f"coordinates: {counts}"
-    )
-    return replace(capture, notes=(note, *capture.notes))
+    counts = {_seen(model): num_images(model) for model in _models_in(home)} | {_seen(model_dir): len(capture.frames)}
+    return replace(capture, notes=(*largest_of("", counts, _seen(model_dir), others="other models"), *capture.notes))
 
 
 def read_model(model_dir: Path) -> ColmapModel:
@@ -87,7 +81,7 @@ def read_model(model_dir: Path) -> ColmapModel:
     cameras_file, images_file, points_file = (_file(model_dir, name) for name in FILES)
     encoding = _ENCODINGS[cameras_file.suffix]
     cameras = _parse(cameras_file, encoding.cameras_from_bytes)
-    images, notes = _parse(images_file, encoding.images_from_bytes)
+    images, notes = _images_of(images_file, cameras)
     if points_file.exists():
         point_ids, points, colours = _parse(points_file, encoding.points_from_bytes)
     else:
@@ -95,14 +89,10 @@ def read_model(model_dir: Path) -> ColmapModel:
         notes = (*notes, f"{points_file} does not exist: no points are read")
     if not images:
         raise UserError(f"{model_dir} has no registered images", "the reconstruction is empty; run it again")
-    for image in images:
-        _check_camera(image, cameras, images_file)
     twice, count = Counter(image.name for image in images).most_common(1)[0]
     if count > 1:
-        raise UserError(
-            f"{model_dir}: image {twice} is registered twice",
-            "each image must have one pose; reconstruct the model again",
-        )
+        hint = "each image must have one pose; reconstruct the model again"
+        raise malformed(model_dir, f"image {twice} is registered twice", hint)
     return ColmapModel(cameras, tuple(sorted(images, key=lambda image: image.name)), points, point_ids, colours, notes)
 
 
@@ -111,23 +101,20 @@ def read_cameras(path: Path) -> tuple[dict[int, Camera], dict[str, int]]:
 
     Image names are known only if the model's images file is beside it.
     """
-    encoding = _ENCODINGS[path.suffix]
-    cameras = _parse(path, encoding.cameras_from_bytes)
+    cameras = _parse(path, _ENCODINGS[path.suffix].cameras_from_bytes)
     images_file = path.with_name(f"images{path.suffix}")
-    if not images_file.is_file():
-        return cameras, {}
-    images, _ = _parse(images_file, encoding.images_from_bytes)
-    for image in images:
-        _check_camera(image, cameras, images_file)
+    images, _ = _images_of(images_file, cameras) if images_file.is_file() else ([], ())
     return cameras, {image.name: image.camera_id for image in images}
 
 
-def _check_camera(image: ColmapImage, cameras: Mapping[int, Camera], images_file: Path) -> None:
-    if image.camera_id not in cameras:
-        raise UserError(
-            f"{images_file}: image {image.name} refers to camera {image.camera_id}, which does not exist",
-            "the files come from different reconstructions; copy all of them again",
-        )
+def _images_of(path: Path, cameras: Mapping[int, Camera]) -> tuple[list[ColmapImage], tuple[str, ...]]:
+    """Return the images of a file, whose cameras there must be, and notes."""
+    images, notes = _parse(path, _ENCODINGS[path.suffix].images_from_bytes)
+    for image in images:
+        if image.camera_id not in cameras:
+            what = f"image {image.name} refers to camera {image.camera_id}, which does not exist"
+            raise malformed(path, what, "the files come from different reconstructions; copy all of them again")
+    return images, notes
 
 
 def _file(model_dir: Path, name: str) -> Path:
@@ -140,9 +127,8 @@ def _parse(path: Path, reader: Callable[[bytes], T]) -> T:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise UserError(
-            f"{path}: {error.strerror or error}", "a COLMAP model needs cameras and images, as .bin or .txt"
-        ) from error
+        hint = "a COLMAP model needs cameras and images, as .bin or .txt"
+        raise malformed(path, error.strerror or str(error), hint) from error
     try:
         return reader(data)
     except UnicodeDecodeError as error:

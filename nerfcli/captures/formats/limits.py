@@ -1,6 +1,6 @@
 """Checks of the numbers in captures, which may be damaged even if the file parses: cameras, positions and poses."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -202,6 +202,15 @@ def left_out(lost: Sequence[tuple[str, UserError]], count: int) -> tuple[str, ..
         )
     names = listed([name for name, _ in lost])
     return (f"{len(lost)} of {several(count, 'frame')} left out: {names} ({error.message})",)
+
+
+def largest_of(
+    kind: str, counts: Mapping[str, int], kept: str, *, noun: str = "photo", others: str = "others"
+) -> tuple[str, ...]:
+    """Return a line on the part of a file that is read, none if it is the only one; `counts` of the parts' photos."""
+    rest = ", ".join(f"{name} with {count}" for name, count in counts.items() if name != kept)
+    what = f"{kind} {kept}".strip() + f" with {several(counts[kept], noun)} is read"
+    return (f"{what}; {others}, which are in other coordinates: {rest}",) if rest else ()
 
 
 def without(names: Sequence[str], what: str) -> tuple[str, ...]:

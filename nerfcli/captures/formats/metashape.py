@@ -27,7 +27,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed, matrix_of, name_of, numbers, read_xml, shown, size_of
 from nerfcli.captures.formats.format import Format, by_suffix
 from nerfcli.captures.formats.lenses import Fits, Terms
-from nerfcli.captures.formats.limits import FramePoses, checked_camera, rigid_pose
+from nerfcli.captures.formats.limits import FramePoses, checked_camera, largest_of, rigid_pose
 from nerfcli.captures.formats.photo_names import with_photos
 from nerfcli.errors import listed as in_words
 from nerfcli.errors import several
@@ -68,7 +68,8 @@ def parse_metashape(path: Path) -> Capture:
         counts = Counter(components)
         kept = max(counts, key=lambda component: counts[component])
         records = [record for record in records if record.get("component_id") == kept]
-        notes += _one_of("component", {shown(component): count for component, count in counts.items()}, shown(kept))
+        named = {shown(component): count for component, count in counts.items()}
+        notes += largest_of("component", named, shown(kept), noun="camera")
     labels = Counter(record.get("label") for record in records)
     cameras: dict[str | None, Camera] = {}
     fits, poses, frames = Fits(), FramePoses(), []
@@ -125,13 +126,6 @@ def _is_enabled(record: Element) -> bool:
     return record.get("enabled", "true") not in ("false", "0")
 
 
-def _one_of(kind: str, counts: Mapping[str, int], kept: str) -> list[str]:
-    """Return a note on the parts of a file in other coordinates, none if there are none; `counts` of their cameras."""
-    others = ", ".join(f"{name} with {count}" for name, count in counts.items() if name != kept)
-    what = f"{kind} {kept} with {several(counts[kept], 'camera')} is read"
-    return [f"{what}; others, which are in other coordinates: {others}"] if others else []
-
-
 def _chunk(path: Path) -> tuple[Element, list[str]]:
     """Return the chunk with most cameras that give frames, an enabled one first, and a note on the others.
 
@@ -150,7 +144,7 @@ def _chunk(path: Path) -> tuple[Element, list[str]]:
         for chunk, count, of_chunk in zip(chunks, usable, reasons, strict=True)
     ]
     best = ranks.index(max(ranks))
-    return chunks[best], _one_of("chunk", dict(zip(names, usable, strict=True)), names[best])
+    return chunks[best], [*largest_of("chunk", dict(zip(names, usable, strict=True)), names[best], noun="camera")]
 
 
 def _worlds_from_chunk(chunk: Element, path: Path) -> dict[str | None, rigid.Similarity | None]:

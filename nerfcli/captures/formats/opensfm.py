@@ -24,10 +24,10 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import lenses
 from nerfcli.captures.formats.fields import malformed, name_of, number, read_json, record_of, shown, size_of, vector
 from nerfcli.captures.formats.format import Format, find_json
-from nerfcli.captures.formats.limits import FramePoses, checked_camera, plausible
+from nerfcli.captures.formats.limits import FramePoses, checked_camera, largest_of, plausible
 from nerfcli.captures.formats.photo_names import with_photos
 from nerfcli.captures.formats.unsupported import distortion, lost_of_cameras, lost_parts, projection
-from nerfcli.errors import UserError, several
+from nerfcli.errors import UserError
 
 IMAGE_FOLDER = "images"
 
@@ -133,11 +133,8 @@ def _largest(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
             record_of(shot, f"{path}: shots.{shown(key)}")
     counts = [len(item["shots"]) for item in content]
     best = counts.index(max(counts))
-    others = ", ".join(f"{index} with {count}" for index, count in enumerate(counts) if index != best)
-    what = (
-        f"reconstruction {best} with {several(counts[best], 'photo')} is read; others, which are in other coordinates"
-    )
-    return content[best], (f"{what}: {others}",) if others else ()
+    named = {str(index): count for index, count in enumerate(counts)}
+    return content[best], largest_of("reconstruction", named, str(best))
 
 
 def _camera(value: Any, where: str) -> Camera:

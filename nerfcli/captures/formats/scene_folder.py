@@ -16,7 +16,7 @@ from nerfcli.atomic import write_json
 from nerfcli.cameras.frame import SensorDepth
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import MODEL_FILES, parse_colmap, read_model, write_colmap_binary
-from nerfcli.captures.formats.fields import read_json_object
+from nerfcli.captures.formats.fields import malformed, read_json_object
 from nerfcli.captures.formats.format import Format, UserInputs, folder_with
 from nerfcli.captures.formats.photo_names import seen_from, with_photos
 from nerfcli.captures.holdout import default_split
@@ -63,9 +63,9 @@ def save(
     if split is None:
         parts = {"test": sorted(default_split([image.name for image in model.images]))}
     else:
-        listed = {part: sorted(name for name, of in split.items() if of == part) for part in ("test", "val")}
-        unused = sorted(name for name, of in split.items() if of is None)
-        parts = {"test": listed["test"], **{k: v for k, v in (("val", listed["val"]), (UNUSED, unused)) if v}}
+        kinds = (("test", "test"), ("val", "val"), (UNUSED, None))
+        parts = {part: sorted(name for name, of in split.items() if of == kind) for part, kind in kinds}
+        parts = {part: names for part, names in parts.items() if names or part == "test"}
     if isinstance(masks, Path):
         mask_entry: Any = seen_from(scene_dir, masks.resolve())
     else:
@@ -144,10 +144,8 @@ def _listed_depths(content: dict[str, Any], path: Path, place: Callable[[str], P
             for name, one in dict(listed).items()
         }
     except (TypeError, ValueError, KeyError, OverflowError) as error:
-        raise UserError(
-            f"{path}: depths are not the depth maps of photos",
-            'expected {"a.jpg": {"path": "a.png", "unit": 0.001, "confidence": null}, ...}',
-        ) from error
+        hint = 'expected {"a.jpg": {"path": "a.png", "unit": 0.001, "confidence": null}, ...}'
+        raise malformed(path, "depths are not the depth maps of photos", hint) from error
 
 
 def _listed_bounds(content: dict[str, Any], path: Path) -> dict[str, tuple[float, float]]:
@@ -155,9 +153,8 @@ def _listed_bounds(content: dict[str, Any], path: Path) -> dict[str, tuple[float
     try:
         bounds = {name: (float(near), float(far)) for name, (near, far) in dict(listed).items()}
     except (TypeError, ValueError, OverflowError) as error:
-        raise UserError(
-            f"{path}: depth_bounds are not pairs of numbers", 'expected {"a.jpg": [near, far], ...}'
-        ) from error
+        hint = 'expected {"a.jpg": [near, far], ...}'
+        raise malformed(path, "depth_bounds are not pairs of numbers", hint) from error
     for name, (near, far) in bounds.items():
         if not 0 < near < far < math.inf:
             raise UserError(f"{path}: depth_bounds of {name} are {near:g} and {far:g}", "expected 0 < near < far")
@@ -171,10 +168,8 @@ def parse_scene(root: Path, given: UserInputs = UserInputs()) -> Capture:
     if content.get("measurement") == "transmission":
         raise UserError(f"{root} is an X-ray scan, not a scene of photos", f"use nerfcli ct train {in_shell(root)}")
     if content.get("version") != SCENE_VERSION:
-        raise UserError(
-            f"{path}: unknown version {content.get('version')!r}, expected {SCENE_VERSION}",
-            "update nerfcli, or estimate the poses again with nerfcli poses",
-        )
+        what = f"unknown version {content.get('version')!r}, expected {SCENE_VERSION}"
+        raise malformed(path, what, "update nerfcli, or estimate the poses again with nerfcli poses")
 
     def place(text: str) -> Path:
         return Path(os.path.normpath(root.resolve() / text))
