@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.framing import Window, cropped, sized, with_lens
+from nerfcli.cameras.framing import cropped, sized, with_lens
 from nerfcli.errors import UserError
 
 PERSPECTIVE = [camera for camera in CAMERAS.values() if not camera.is_spherical]
@@ -39,10 +39,10 @@ def test_with_one_of_width_and_height_the_other_follows(width, height, size):
 def test_pixels_of_a_part_see_what_they_saw(camera, data):
     x = data.draw(st.integers(0, camera.width - 1))
     y = data.draw(st.integers(0, camera.height - 1))
-    window = Window(x, y, data.draw(st.integers(1, camera.width - x)), data.draw(st.integers(1, camera.height - y)))
-    part = cropped(camera, window)
-    assert (part.width, part.height) == (window.width, window.height)
-    corners = np.array([[0.5, 0.5], [window.width - 0.5, window.height - 0.5]])
+    size = data.draw(st.integers(1, camera.width - x)), data.draw(st.integers(1, camera.height - y))
+    part = cropped(camera, x, y, *size)
+    assert part.size == size
+    corners = np.array([(0.5, 0.5), np.subtract(size, 0.5)])
     seen, valid = part.bearings(corners)
     whole, also = camera.bearings(corners + np.array([x, y]))
     np.testing.assert_array_equal(valid, also)
@@ -52,7 +52,7 @@ def test_pixels_of_a_part_see_what_they_saw(camera, data):
 @pytest.mark.parametrize("window", [(0, 0, 0, 5), (-1, 0, 5, 5), (630, 0, 11, 5), (0, 476, 5, 5)])
 def test_a_part_outside_of_the_picture_is_refused(window):
     with pytest.raises(UserError, match="is not inside a picture of 640x480") as caught:
-        cropped(Camera.pinhole(640, 480, 500.0), Window(*window))
+        cropped(Camera.pinhole(640, 480, 500.0), *window)
     assert caught.value.exit_code == 2
 
 
@@ -86,7 +86,7 @@ def test_a_picture_of_all_directions():
     with pytest.raises(UserError, match="500x300"):
         sized(camera, 500, 300)
     with pytest.raises(UserError, match="cannot be cropped"):
-        cropped(camera, Window(0, 0, 10, 10))
+        cropped(camera, 0, 0, 10, 10)
 
 
 @pytest.mark.parametrize(

@@ -48,21 +48,16 @@ class Camera:
 
     def __post_init__(self) -> None:
         if self.model not in DISTORTIONS:
-            raise UserError(
-                f"unknown camera model {self.model!r}", f"expected one of COLMAP's: {', '.join(sorted(DISTORTIONS))}"
-            )
+            hint = f"expected one of COLMAP's: {', '.join(sorted(DISTORTIONS))}"
+            raise UserError(f"unknown camera model {self.model!r}", hint)
         if self.width < 1 or self.height < 1:
-            raise UserError(
-                f"invalid size of a camera: {self.width}x{self.height} pixels",
-                "width and height must be integers of at least 1",
-            )
+            hint = "width and height must be integers of at least 1"
+            raise UserError(f"invalid size of a camera: {self.width}x{self.height} pixels", hint)
         object.__setattr__(self, "params", tuple(float(value) for value in self.params))
         names = parameter_names(self.model)
         if len(self.params) != len(names):
-            raise UserError(
-                f"camera model {self.model} has {len(names)} parameters, got {len(self.params)}",
-                f"expected {', '.join(names)}, in this order",
-            )
+            hint = f"expected {', '.join(names)}, in this order"
+            raise UserError(f"camera model {self.model} has {len(names)} parameters, got {len(self.params)}", hint)
         if complaint := _complaint(self.model, self.values):
             raise UserError(f"invalid parameters {self.params} for camera model {self.model}", complaint)
 
@@ -273,10 +268,8 @@ class Camera:
             model, params = str(content["model"]), tuple(float(value) for value in content["params"])
             width, height = int(content["width"]), int(content["height"])
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise UserError(
-                f"not a valid camera: {type(error).__name__}: {error}",
-                'expected {"model": COLMAP\'s name, "width": pixels, "height": pixels, "params": [numbers]}',
-            ) from error
+            hint = 'expected {"model": COLMAP\'s name, "width": pixels, "height": pixels, "params": [numbers]}'
+            raise UserError(f"not a valid camera: {type(error).__name__}: {error}", hint) from error
         return Camera(model, width, height, params)
 
     def _opening_deg(self, pixels: np.ndarray) -> float:

@@ -4,22 +4,12 @@ Notation: the camera's picture is w x h; the new picture is W x H.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.errors import UserError
 
 LENSES = ("pinhole", "fisheye", "equirectangular")
-
-
-@dataclass(frozen=True)
-class Window:
-    """A crop of a picture in pixels: left and top edge, width and height."""
-
-    x: int
-    y: int
-    width: int
-    height: int
 
 
 def sized(camera: Camera, width: int | None, height: int | None) -> Camera:
@@ -45,24 +35,20 @@ def sized(camera: Camera, width: int | None, height: int | None) -> Camera:
     return covering.shifted((width - scale * camera.width) / 2, (height - scale * camera.height) / 2)
 
 
-def cropped(camera: Camera, window: Window) -> Camera:
-    """Return the camera of a crop of the picture.
+def cropped(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
+    """Return the camera of a crop of the picture: left and top edge, width and height in pixels.
 
     Raises:
         UserError: the crop is empty or extends beyond the picture, or the picture is equirectangular.
     """
     if camera.is_spherical:
         raise UserError("an equirectangular picture cannot be cropped", "remove --crop", exit_code=2)
-    inside = window.x >= 0 and window.y >= 0 and window.width >= 1 and window.height >= 1
-    inside = inside and window.x + window.width <= camera.width and window.y + window.height <= camera.height
+    inside = min(x, y) >= 0 and min(width, height) >= 1 and x + width <= camera.width and y + height <= camera.height
     if not inside:
-        raise UserError(
-            f"--crop {window.x},{window.y},{window.width},{window.height} is not inside a picture of "
-            f"{camera.width}x{camera.height}",
-            "give X,Y,WIDTH,HEIGHT in pixels from the top-left corner, after --width and --height are applied",
-            exit_code=2,
-        )
-    return replace(camera, width=window.width, height=window.height).shifted(-window.x, -window.y)
+        what = f"--crop {x},{y},{width},{height} is not inside a picture of {camera.width}x{camera.height}"
+        hint = "give X,Y,WIDTH,HEIGHT in pixels from the top-left corner, after --width and --height are applied"
+        raise UserError(what, hint, exit_code=2)
+    return replace(camera, width=width, height=height).shifted(-x, -y)
 
 
 def with_lens(camera: Camera, lens: str, fov_deg: float | None) -> Camera:
@@ -78,19 +64,13 @@ def with_lens(camera: Camera, lens: str, fov_deg: float | None) -> Camera:
     width, height = camera.width, camera.height
     if lens == "equirectangular":
         if fov_deg is not None:
-            raise UserError(
-                "--fov cannot be used with equirectangular pictures, which cover 360 degrees",
-                "remove --fov",
-                exit_code=2,
-            )
+            what = "--fov cannot be used with equirectangular pictures, which cover 360 degrees"
+            raise UserError(what, "remove --fov", exit_code=2)
         return equirectangular(2 * height, height)
     most = 179.0 if lens == "pinhole" else 360.0
     if fov_deg is not None and not 0 < fov_deg <= most:  # True at NaN
-        raise UserError(
-            f"--fov {fov_deg:g} is out of range for a {lens} lens",
-            f"expected degrees above 0 and up to {most:g}",
-            exit_code=2,
-        )
+        hint = f"expected degrees above 0 and up to {most:g}"
+        raise UserError(f"--fov {fov_deg:g} is out of range for a {lens} lens", hint, exit_code=2)
     if lens == "fisheye":
         focal_px = width / math.radians(180.0 if fov_deg is None else fov_deg)
         return Camera("SIMPLE_FISHEYE", width, height, (focal_px, width / 2, height / 2))
@@ -106,9 +86,6 @@ def equirectangular(width: int, height: int) -> Camera:
         UserError: the width is not twice the height, which would stretch the picture.
     """
     if width != 2 * height:
-        raise UserError(
-            f"invalid size of an equirectangular picture: {width}x{height}",
-            "its width must be twice its height; give only an even --width, or only --height",
-            exit_code=2,
-        )
+        hint = "its width must be twice its height; give only an even --width, or only --height"
+        raise UserError(f"invalid size of an equirectangular picture: {width}x{height}", hint, exit_code=2)
     return Camera("EQUIRECTANGULAR", width, height, (width, height))

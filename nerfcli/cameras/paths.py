@@ -170,10 +170,8 @@ def orbit(frames: Sequence[Frame], *, count: int, depth_hint: float | None = Non
     distances = np.linalg.norm(offsets, axis=1)
     elsewhere = distances > 0
     if not elsewhere.any():
-        raise UserError(
-            "all cameras are in one place and look outwards: there is nothing to orbit",
-            "use --cameras interpolate, the path through the photos",
-        )
+        hint = "use --cameras interpolate, the path through the photos"
+        raise UserError("all cameras are in one place and look outwards: there is nothing to orbit", hint)
     if surrounds(frames, up):
         curve = _ring(offsets[elsewhere], distances[elsewhere], up)
     else:

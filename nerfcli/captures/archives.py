@@ -77,9 +77,8 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
         with zipfile.ZipFile(path) as archive:
             yield archive
     except NotImplementedError as error:  # a method of compression, such as Deflate64
-        raise UserError(
-            f"{path} cannot be unpacked: {error}", "unpack it with another program, and give the folder"
-        ) from error
+        hint = "unpack it with another program, and give the folder"
+        raise UserError(f"{path} cannot be unpacked: {error}", hint) from error
     except _DAMAGED as error:
         raise UserError(f"{path} is not a readable zip archive: {error}", "copy or download it again") from error
 
@@ -143,10 +142,8 @@ def _extract(
     total = sum(entry.file_size for entry in members)
     home = next(parent for parent in folder.parents if parent.exists())
     if total > (free := shutil.disk_usage(home).free):
-        raise UserError(
-            f"{folder} would need {total / 1e9:.1f} GB, and {home} has only {free / 1e9:.1f} GB",
-            "free some space, or choose another output",
-        )
+        hint = "free some space, or choose another output"
+        raise UserError(f"{folder} would need {total / 1e9:.1f} GB, and {home} has only {free / 1e9:.1f} GB", hint)
     done = 0
     with atomic_folder(folder) as partial:
         for entry in members:

@@ -37,10 +37,8 @@ def opencv_from_axes(axes: str) -> np.ndarray:
     letters = NAMED_AXES.get(axes, axes)
     columns = np.array([_DIRECTIONS.get(letter, (0, 0, 0)) for letter in letters], dtype=np.float64).T
     if columns.shape != (3, 3) or abs(np.linalg.det(columns)) < 0.5:
-        raise UserError(
-            f"unknown camera axes {axes!r}",
-            f"choose {', '.join(NAMED_AXES)}, or three letters for where x, y and z point: rdf, rub, ...",
-        )
+        hint = f"choose {', '.join(NAMED_AXES)}, or three letters for where x, y and z point: rdf, rub, ..."
+        raise UserError(f"unknown camera axes {axes!r}", hint)
     if np.linalg.det(columns) < 0:
         raise UserError(f"camera axes {axes!r} are left-handed", "reverse one of the axes")
     turn = rigid.from_parts(columns, np.zeros(3))

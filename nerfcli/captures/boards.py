@@ -254,14 +254,11 @@ class CharucoBoard:
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 2:
-            raise UserError(
-                f"invalid ChArUco board of {self.columns}x{self.rows} squares", "it needs at least 2x2 squares"
-            )
+            hint = "it needs at least 2x2 squares"
+            raise UserError(f"invalid ChArUco board of {self.columns}x{self.rows} squares", hint)
         if not 0 < self.marker < self.square < np.inf:
-            raise UserError(
-                f"invalid ChArUco board with squares of {self.square:g} m and markers of {self.marker:g} m",
-                "expected positive lengths in metres, with markers smaller than squares",
-            )
+            what = f"invalid ChArUco board with squares of {self.square:g} m and markers of {self.marker:g} m"
+            raise UserError(what, "expected positive lengths in metres, with markers smaller than squares")
 
 
 def scale_from_markers(frames: Sequence[Frame], side: float, *, dictionary: str) -> ScaleEstimate:

@@ -78,10 +78,8 @@ def _of_picture(calibration: Calibration, picture: Picture, same_name: Mapping[s
     same_folder = {number for name, number in same_name.items() if path.endswith(f"/{name}") and "/" in name}
     listed = same_folder or set(same_name.values())
     if len(listed) > 1:
-        raise UserError(
-            f"{calibration.path} lists {len(listed)} images called {picture.path.name}, with different cameras",
-            "give a file that lists only the cameras of these photos",
-        )
+        what = f"{calibration.path} lists {len(listed)} images called {picture.path.name}, with different cameras"
+        raise UserError(what, "give a file that lists only the cameras of these photos")
     if listed:
         number = next(iter(listed))
         return PhotoCalibration(_fitted(calibration, number, picture), number, by_name=True)
@@ -123,9 +121,8 @@ def read_intrinsics(path: Path) -> Camera:
     """Read the camera in a file, see `read_calibration`."""
     cameras = read_calibration(path).cameras
     if len(cameras) != 1:
-        raise UserError(
-            f"{path} has {len(cameras)} different cameras", "give a file with the single camera of all frames"
-        )
+        hint = "give a file with the single camera of all frames"
+        raise UserError(f"{path} has {len(cameras)} different cameras", hint)
     return cameras[0]
 
 

@@ -198,10 +198,8 @@ def accepted_losses(capture: Capture, wanted: TargetOptions, others: tuple[str, 
     # refuse.
     refused = (*others, *form.losses(replace(capture, observations=None)))
     if refused and not wanted.allow_loss:
-        raise UserError(
-            f"{form.name} cannot hold everything in this capture; it would lose: {'; '.join(losses)}",
-            "add --allow-loss to drop that, or use another format, such as nerfcli, which holds the most",
-        )
+        hint = "add --allow-loss to drop that, or use another format, such as nerfcli, which holds the most"
+        raise UserError(f"{form.name} cannot hold everything in this capture; it would lose: {'; '.join(losses)}", hint)
     return losses
 
 
@@ -231,15 +229,11 @@ def _convention(form: Format, wanted: TargetOptions) -> Convention:
     if wanted.convention != Convention(wanted.convention.axes, pixel_centre=pixel_centre):
         raise ValueError(f"only axes and pixel centre of a written file can be chosen, got {wanted.convention}")
     if not np.array_equal(opencv_from_axes(axes), opencv_from_axes(form.axes)) and not form.open_axes:
-        raise UserError(
-            f"{form.name} prescribes the camera axes {form.axes}, not {axes}",
-            "remove --axes; programs that read this format expect its own axes",
-        )
+        hint = "remove --axes; programs that read this format expect its own axes"
+        raise UserError(f"{form.name} prescribes the camera axes {form.axes}, not {axes}", hint)
     if pixel_centre != 0.5 and not form.open_centre:
-        raise UserError(
-            f"{form.name} prescribes the pixel convention: the top-left pixel's centre is (0.5, 0.5)",
-            "remove --pixel-center; programs that read this format expect its own convention",
-        )
+        hint = "remove --pixel-center; programs that read this format expect its own convention"
+        raise UserError(f"{form.name} prescribes the pixel convention: the top-left pixel's centre is (0.5, 0.5)", hint)
     return Convention(axes, pixel_centre=pixel_centre)
 
 

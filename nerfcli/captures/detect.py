@@ -135,10 +135,8 @@ def _evidence(capture: Capture, progress: Callable[[float, str], None]) -> Evide
         return MatchEvidence(pairs, cameras, len(capture.frames))
     if len(capture.points):
         return FrustumEvidence(capture)
-    raise UserError(
-        "the convention cannot be detected: no photo matches another, and there are no 3D points",
-        "give the photo folder with --images",
-    )
+    hint = "give the photo folder with --images"
+    raise UserError("the convention cannot be detected: no photo matches another, and there are no 3D points", hint)
 
 
 def _different_axes(declared: str) -> Iterable[str]:

@@ -65,10 +65,8 @@ def names_held_out(rule: str, names: Iterable[str], *, others: Iterable[str] = (
     else:
         held_out = _listed(Path(rule), frozenset(present), frozenset(others))
     if not held_out or len(held_out) == len(present):
-        raise UserError(
-            f"the split {rule} holds out {len(held_out)} of {len(present)} photos",
-            "choose another --holdout: some photos are needed for training and some for evaluation",
-        )
+        hint = "choose another --holdout: some photos are needed for training and some for evaluation"
+        raise UserError(f"the split {rule} holds out {len(held_out)} of {len(present)} photos", hint)
     return held_out
 
 
@@ -109,8 +107,6 @@ def _listed(path: Path, present: frozenset[str], others: frozenset[str]) -> froz
     unknown = sorted(listed - present - others)
     if unknown:
         shown = ", ".join(unknown[:_NAMES_SHOWN])
-        raise UserError(
-            f"{path} lists {several(len(unknown), 'name that matches', 'names that match')} no photo: {shown}",
-            f"write names as in the capture, such as {min(present, default='a.jpg')}",
-        )
+        what = f"{path} lists {several(len(unknown), 'name that matches', 'names that match')} no photo: {shown}"
+        raise UserError(what, f"write names as in the capture, such as {min(present, default='a.jpg')}")
     return listed & present

@@ -101,10 +101,8 @@ def turn_to_upright(camera: Camera, picture: Picture) -> tuple[int, Size]:
     """
     orientation, stored, upright = picture.orientation, picture.stored_size, picture.size
     if orientation not in _TURNS:
-        raise UserError(
-            f"{picture.path}: EXIF orientation {orientation} mirrors the photo, which is not supported",
-            "save the photo upright without the tag and estimate the poses again",
-        )
+        what = f"{picture.path}: EXIF orientation {orientation} mirrors the photo, which is not supported"
+        raise UserError(what, "save the photo upright without the tag and estimate the poses again")
     if stored != upright and _shape_error(camera, stored) > _shape_error(camera, upright):
         return 1, upright
     _refuse_sphere(camera, picture)
@@ -280,10 +278,8 @@ def _turn(frame: Frame, pixels: str) -> int:
 def _refuse_sphere(camera: Camera, picture: Picture) -> None:
     """Refuse to turn a picture of the whole sphere, whose camera cannot be turned about an optical axis."""
     if picture.orientation != 1 and camera.is_spherical:
-        raise UserError(
-            f"{picture.path}: a spherical picture with EXIF orientation {picture.orientation}",
-            "save the panorama upright without the tag",
-        )
+        hint = "save the panorama upright without the tag"
+        raise UserError(f"{picture.path}: a spherical picture with EXIF orientation {picture.orientation}", hint)
 
 
 def _fits(mask: Path, camera: Camera, before: Camera, pixels: str) -> bool:

@@ -97,18 +97,14 @@ class KnownDistance:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.units) and self.units > 0):
-            raise UserError(
-                f"{self.name}: the two points coincide in the scene", "give a distance between two other points"
-            )
+            hint = "give a distance between two other points"
+            raise UserError(f"{self.name}: the two points coincide in the scene", hint)
         if not (math.isfinite(self.metres) and self.metres > 0):
-            raise UserError(
-                f"{self.name}: invalid distance of {self.metres:g} m", "expected a positive length in metres"
-            )
+            hint = "expected a positive length in metres"
+            raise UserError(f"{self.name}: invalid distance of {self.metres:g} m", hint)
         if self.tolerance is not None and not 0 < self.tolerance < self.metres:
-            raise UserError(
-                f"{self.name}: invalid standard error, {self.metres:g} m ± {self.tolerance:g} m",
-                "the standard error must be positive and smaller than the length",
-            )
+            hint = "the standard error must be positive and smaller than the length"
+            raise UserError(f"{self.name}: invalid standard error, {self.metres:g} m ± {self.tolerance:g} m", hint)
 
 
 def known_distance(text: str, frames: Sequence[Frame]) -> KnownDistance:
@@ -190,17 +186,14 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
     """
     used = sorted((frame for frame in frames if frame.name in positions), key=lambda frame: frame.name)
     if len(used) < 2:
-        raise UserError(
-            f"{'only 1' if used else 'none'} of {len(frames)} photos with a pose has a GPS position in its EXIF",
-            "at least 2 are needed; give a known distance instead",
-        )
+        what = f"{'only 1' if used else 'none'} of {len(frames)} photos with a pose has a GPS position in its EXIF"
+        raise UserError(what, "at least 2 are needed; give a known distance instead")
     x = centres_of(used)
     y = east_north_up([positions[frame.name] for frame in used])
     if not (np.ptp(x, axis=0).max() > 0 and np.ptp(y, axis=0).max() > 0):
         which = "GPS positions" if np.ptp(x, axis=0).max() > 0 else "cameras"
-        raise UserError(
-            f"the {which} of all {len(used)} photos are identical", "this gives no scale; give a known distance instead"
-        )
+        hint = "this gives no scale; give a known distance instead"
+        raise UserError(f"the {which} of all {len(used)} photos are identical", hint)
     fit = align_robustly(x, y)
     keep = fit.follows
     enough = int(keep.sum()) >= _ENOUGH_TO_TELL

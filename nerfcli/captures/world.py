@@ -49,9 +49,8 @@ def transformed(capture: Capture, new_from_world: Similarity) -> Capture:
 def up_aligned(frames: Sequence[Frame], axis: str) -> Similarity:
     """Return the smallest rotation about the origin that turns the up direction onto an axis of the new frame."""
     if axis not in WORLD_AXES:
-        raise UserError(
-            f"unknown axis {axis!r} for the up direction", f"choose one of {', '.join(WORLD_AXES)}", exit_code=2
-        )
+        hint = f"choose one of {', '.join(WORLD_AXES)}"
+        raise UserError(f"unknown axis {axis!r} for the up direction", hint, exit_code=2)
     return Similarity(1.0, smallest_rotation(up_direction(frames), WORLD_AXES[axis]), np.zeros(3))
 
 
@@ -121,7 +120,9 @@ class Moved:
 
 def in_world_frame(capture: Capture, wanted: WorldFrame) -> Moved:
     """Move a capture to another world frame: first the origin, then the up axis, then the scale about that origin."""
-    _check_combination(wanted)
+    given = {"--scale": wanted.scale, "--markers": wanted.markers, "--distance": wanted.distances or None}
+    if len(named := [name for name, value in given.items() if value is not None]) > 1:
+        raise UserError(f"{' and '.join(named)} cannot be combined", "give only one of them", exit_code=2)
     estimate = _estimate(capture, wanted)
     change = Similarity.identity()
     if wanted.origin is not None:
@@ -136,12 +137,6 @@ def in_world_frame(capture: Capture, wanted: WorldFrame) -> Moved:
     if estimate is not None:
         moved = replace(moved, unit="metre", unit_source=_source(estimate))
     return Moved(moved, change, estimate)
-
-
-def _check_combination(wanted: WorldFrame) -> None:
-    given = {"--scale": wanted.scale, "--markers": wanted.markers, "--distance": wanted.distances or None}
-    if len(named := [name for name, value in given.items() if value is not None]) > 1:
-        raise UserError(f"{' and '.join(named)} cannot be combined", "give only one of them", exit_code=2)
 
 
 def _source(estimate: ScaleEstimate) -> str:
@@ -173,11 +168,8 @@ def _scale_from_markers(frames: Sequence[Frame], text: str) -> ScaleEstimate:
         board = CharucoBoard(columns, rows, float(square), float(marker), dictionary, legacy=bool(more))
         return scale_from_charuco(frames, board)
     except ValueError as error:
-        raise UserError(
-            f"invalid --markers {text!r}",
-            "expected markers DICT_4X4_50:0.05, or a ChArUco board DICT_5X5_100:7x5:0.04:0.03, sides in metres",
-            exit_code=2,
-        ) from error
+        hint = "expected markers DICT_4X4_50:0.05, or a ChArUco board DICT_5X5_100:7x5:0.04:0.03, sides in metres"
+        raise UserError(f"invalid --markers {text!r}", hint, exit_code=2) from error
 
 
 def _factor(text: str | None) -> float:

@@ -59,10 +59,8 @@ class Given:
     def refuse_taken(self, result: Path) -> None:
         """Refuse a path that is the result of another input, too; with --overwrite, only the last would stay."""
         if (other := self.taken.setdefault(result, self.path)) != self.path:
-            raise UserError(
-                f"{result} is the result of {other}, which has the same name",
-                "give these inputs one by one, each with its own -o",
-            )
+            hint = "give these inputs one by one, each with its own -o"
+            raise UserError(f"{result} is the result of {other}, which has the same name", hint)
 
 
 def for_each_input(source: str, work: Callable[[Given], None], *, command: str) -> None:

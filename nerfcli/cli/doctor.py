@@ -63,10 +63,8 @@ def doctor(
     def work(given: Given) -> None:
         path = given.path
         if find_run(path) is not None:
-            raise UserError(
-                f"{path} is a run: doctor examines photos and scenes",
-                "nerfcli report RUN shows how many photos see what; render has --outputs coverage,parallax",
-            )
+            hint = "nerfcli report RUN shows how many photos see what; render has --outputs coverage,parallax"
+            raise UserError(f"{path} is a run: doctor examines photos and scenes", hint)
         page = writing.beside(given, "-doctor.html")
         with console.stage(f"doctor {path.name}") as reporter:
             subject = find_subject(path, subfolders=subfolders)
@@ -97,8 +95,5 @@ def check_gate(findings: Sequence[Finding], require: str | None) -> None:
         return
     worse = [f for f in findings if VERDICTS.index(f.verdict) > VERDICTS.index(require)]
     if worse:
-        raise UserError(
-            f"--require {require} is not met by {', '.join(f'{f.check} ({f.verdict})' for f in worse)}",
-            worse[0].advice or "see the table",
-            GATE_NOT_MET,
-        )
+        what = f"--require {require} is not met by {', '.join(f'{f.check} ({f.verdict})' for f in worse)}"
+        raise UserError(what, worse[0].advice or "see the table", GATE_NOT_MET)

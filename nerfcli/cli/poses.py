@@ -148,10 +148,8 @@ def poses(
     from nerfcli.workflows.poses import estimate_poses, folder_with_frames, plan_scene, without_suffix
 
     if taken.intrinsics is not None and matching.camera_model != "auto":
-        raise typer.BadParameter(
-            "cannot be combined with --intrinsics, which gives the camera models; remove --camera-model",
-            param_hint="--camera-model",
-        )
+        message = "cannot be combined with --intrinsics, which gives the camera models; remove --camera-model"
+        raise typer.BadParameter(message, param_hint="--camera-model")
     console, resources = printing.console, Resources(threads)
     settings = matching.added_to(taken.settings(seed, resources.cores))
 

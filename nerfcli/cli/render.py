@@ -86,8 +86,7 @@ class ViewOptions:
             match = re.fullmatch(r"(\d+),(\d+),(\d+),(\d+)", self.crop.replace(" ", ""))
             if match is None:
                 raise typer.BadParameter(f"{self.crop!r}; write X,Y,WIDTH,HEIGHT in pixels", param_hint="--crop")
-            x, y, crop_width, crop_height = (int(part) for part in match.groups())
-            window = (x, y, crop_width, crop_height)
+            window = (int(match[1]), int(match[2]), int(match[3]), int(match[4]))
         return PictureOptions(self.width, self.height, self.lens, self.fov, window)
 
 
@@ -228,9 +227,8 @@ class FileOptions:
         if "png16" in chosen and "depth" not in outputs:
             raise typer.BadParameter("png16 is a depth format; add depth to --outputs", param_hint=hint)
         if "png16" in chosen and convention == "moment":
-            raise typer.BadParameter(
-                "png16 uses 0 for no depth, but the moment of an empty ray is 0; use another format", param_hint=hint
-            )
+            message = "png16 uses 0 for no depth, but the moment of an empty ray is 0; use another format"
+            raise typer.BadParameter(message, param_hint=hint)
         return chosen
 
     def _videos(self, fps: float) -> "VideoSettings":
@@ -239,9 +237,8 @@ class FileOptions:
 
         chosen = some_of(self.video_format or "mp4", ENCODERS, "--video-format")
         if "gif" in chosen and fps > GIF_FASTEST_FPS:
-            raise typer.BadParameter(
-                f"{fps:g}; a gif plays at {GIF_FASTEST_FPS:g} frames per second at most", param_hint="--fps"
-            )
+            message = f"{fps:g}; a gif plays at {GIF_FASTEST_FPS:g} frames per second at most"
+            raise typer.BadParameter(message, param_hint="--fps")
         return VideoSettings(chosen, fps)
 
 
@@ -356,9 +353,8 @@ def _refuse_unused(seen: ViewOptions, depths: DepthOptions, files: FileOptions, 
     }
     refuse_unused(unused, "it works with {}; add that, or remove it")
     if files.rgba and files.writes_video:
-        raise typer.BadParameter(
-            "videos have no alpha channel; remove --rgba or the video options", param_hint="--rgba"
-        )
+        message = "videos have no alpha channel; remove --rgba or the video options"
+        raise typer.BadParameter(message, param_hint="--rgba")
 
 
 def frame_range(text: str) -> slice:

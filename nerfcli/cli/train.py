@@ -199,9 +199,8 @@ def train(
     from nerfcli.workflows.train import plan_training, train_scene
 
     if is_one_of_several() and (fit.dry_run or scene == STDIN):
-        raise UserError(
-            "torchrun works only with one scene, and without --dry-run", "use this command without torchrun", 2
-        )
+        hint = "use this command without torchrun"
+        raise UserError("torchrun works only with one scene, and without --dry-run", hint, 2)
     console = Console(quiet=printing.quiet or not is_first(), json_lines=printing.json)
     settings = fit.settings(training)
     how = {"holdout": options.holdout_rule(fit.holdout), "resources": fit.resources(training)}

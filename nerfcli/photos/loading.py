@@ -58,9 +58,8 @@ def is_transparent(pixels: np.ndarray) -> bool:
 def load_photo(frame: Frame, factor: float, masks: str) -> LoadedPhoto:
     """Read one photo, with arguments as for `load_photos`."""
     if frame.image is None:
-        raise UserError(
-            f"{frame.name} has no photo", "this view can be rendered, but not used for training or evaluation"
-        )
+        hint = "this view can be rendered, but not used for training or evaluation"
+        raise UserError(f"{frame.name} has no photo", hint)
     if not frame.image.exists():
         raise UserError(
             f"photo not found: {frame.image.resolve()}",

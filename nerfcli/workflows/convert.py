@@ -116,10 +116,8 @@ def _report_missing(capture: Capture, reporter: Reporter) -> None:
     missing = [*(frame.name for frame in capture.frames if not frame.has_photo), *capture.missing]
     count = len(capture.missing) + len(capture.frames)
     if len(missing) == count:
-        raise UserError(
-            f"none of the {several(count, 'photo')} of the capture is on disk, such as {missing[0]}",
-            "give their folder with --images; poses without photos can be written with --to tum",
-        )
+        hint = "give their folder with --images; poses without photos can be written with --to tum"
+        raise UserError(f"none of the {several(count, 'photo')} of the capture is on disk, such as {missing[0]}", hint)
     if missing:
         reporter.warn(f"{len(missing)} of {several(count, 'photo')} missing: {listed(missing)}")
 
@@ -201,10 +199,9 @@ def contents(capture: Capture) -> str:
     """Describe the content of a capture in a few words."""
     cameras = len({frame.camera for frame in capture.frames})
     masks = sum(frame.mask is not None for frame in capture.frames)
-    counts = ((len(capture.frames), "image"), (cameras, "camera"), (len(capture.points), "point"))
-    return ", ".join(
-        [*(several(number, noun) for number, noun in counts), *([several(masks, "mask")] if masks else [])]
-    )
+    counts = [(len(capture.frames), "image"), (cameras, "camera"), (len(capture.points), "point")]
+    counts += [(masks, "mask")] if masks else []
+    return ", ".join(several(number, noun) for number, noun in counts)
 
 
 def _record(done: Conversion) -> dict[str, Any]:

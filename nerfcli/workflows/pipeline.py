@@ -204,11 +204,8 @@ def _refuse_unused(photos: Path, poses: PoseSettings, *, frames: int | None, int
     """Refuse settings of poses for a capture that has poses."""
     usual = PoseSettings(seed=poses.seed, threads=poses.threads, holdout=poses.holdout)
     if frames is not None or intrinsics is not None or poses != usual:
-        raise UserError(
-            f"{photos} has poses, which are used: --frames, --intrinsics, --quality and --subfolders do nothing",
-            "remove them; for new poses, give the folder of its photos",
-            exit_code=2,
-        )
+        what = f"{photos} has poses, which are used: --frames, --intrinsics, --quality and --subfolders do nothing"
+        raise UserError(what, "remove them; for new poses, give the folder of its photos", exit_code=2)
 
 
 def _capture_of(photos: Path, output: Output, reporter: Reporter) -> Path | None:

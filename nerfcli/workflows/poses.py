@@ -161,10 +161,8 @@ def folder_with_frames(source: Path, scene: Path) -> Path:
         raise UserError(f"--dry-run: {source} is an archive, and a dry run does not unpack it", hint)
     folder = frames_folder(scene) if source.is_file() else source
     if source.is_file() and not folder.exists():
-        raise UserError(
-            f"--dry-run: the frames of {source} are not in {folder} yet, and a dry run does not extract them",
-            "run it without --dry-run, or give a folder of photos",
-        )
+        what = f"--dry-run: the frames of {source} are not in {folder} yet, and a dry run does not extract them"
+        raise UserError(what, "run it without --dry-run, or give a folder of photos")
     return folder
 
 

@@ -120,23 +120,14 @@ def render_splats(
     if not path.is_file():
         raise UserError(f"{path} does not exist", "give a .ply or .spz of splats")
     if views.cameras in ("test", "train", *PATHS):
-        raise UserError(
-            f"{path} has no cameras, so --cameras {views.cameras} is not known",
-            "give a file or folder of cameras, or render the run: nerfcli render RUN --splats FILE",
-            exit_code=2,
-        )
+        hint = "give a file or folder of cameras, or render the run: nerfcli render RUN --splats FILE"
+        raise UserError(f"{path} has no cameras, so --cameras {views.cameras} is not known", hint, exit_code=2)
     if settings.needs_visibility:
-        raise UserError(
-            "coverage, parallax and errors of depth need training photos",
-            "leave them out, or render the run: nerfcli render RUN --splats FILE",
-            exit_code=2,
-        )
+        hint = "leave them out, or render the run: nerfcli render RUN --splats FILE"
+        raise UserError("coverage, parallax and errors of depth need training photos", hint, exit_code=2)
     if settings.depth.convention == "background" and settings.depth.background_distance is None:
-        raise UserError(
-            "--depth background of a file of splats needs a distance for light that hits nothing",
-            "add --background-distance",
-            exit_code=2,
-        )
+        what = "--depth background of a file of splats needs a distance for light that hits nothing"
+        raise UserError(what, "add --background-distance", exit_code=2)
     resources.begin()
     splats = load_splats(path, notify=reporter.note)
     frames = frames_of_file(views)

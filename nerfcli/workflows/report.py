@@ -68,10 +68,8 @@ def report_runs(
         on_progress = reporter.part(index / len(runs), (index + 1) / len(runs), described.label)
         model = run.model(resources.torch_device)
         if model.sha256 != hashes[index]:
-            raise UserError(
-                f"{run.field_path} was replaced while the report was written",
-                "run the command again when the training is complete",
-            )
+            hint = "run the command again when the training is complete"
+            raise UserError(f"{run.field_path} was replaced while the report was written", hint)
         frames = [frame for frame in run.cameras.test if frame.name in names[index]]
         held_out = held_out_photos(run, frames)
         compared = [photo for photo in held_out if photo.used is None or photo.used.any()]

@@ -74,16 +74,11 @@ def export_splats(run: Run, model: Model, path: Path, *, settings: SplatSettings
         KeyboardInterrupt: passed on after the state of the refinement has been saved.
     """
     if path.suffix.lower() == ".html" and settings.frame == "scene":
-        raise UserError(
-            "--frame scene is for .ply and .spz: the page needs y to point down",
-            "remove it, or write a .ply",
-            exit_code=2,
-        )
+        hint = "remove it, or write a .ply"
+        raise UserError("--frame scene is for .ply and .spz: the page needs y to point down", hint, exit_code=2)
     if any(frame.camera.is_spherical for frame in run.cameras.train):
-        raise UserError(
-            f"{run.path} was trained on 360-degree photos, which splats cannot be fitted to",
-            "export it as a page, a mesh or points: --to page, mesh or points",
-        )
+        hint = "export it as a page, a mesh or points: --to page, mesh or points"
+        raise UserError(f"{run.path} was trained on 360-degree photos, which splats cannot be fitted to", hint)
     splats = run_splats(run, model, settings=settings, reporter=reporter)
     file_from_scene = Similarity.identity() if settings.frame == "scene" else viewer_from_scene(run)
     gaussians = splats.gaussians().moved(file_from_scene)
@@ -205,10 +200,8 @@ def _kept(run: Run, model: Model, settings: SplatSettings) -> RunSplats | None:
         and settings.count in (None, splats.count)
     )
     if settings.resume and not same:
-        raise UserError(
-            f"the splats in {run.path} are missing, or were made from another field, --count or --sh",
-            "leave out --resume to make new splats",
-        )
+        hint = "leave out --resume to make new splats"
+        raise UserError(f"the splats in {run.path} are missing, or were made from another field, --count or --sh", hint)
     if not same or splats is None:
         return None
     is_enough = splats.refinement.seconds >= settings.budget_seconds

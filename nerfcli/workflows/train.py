@@ -196,10 +196,8 @@ def _keeps(task: _Task) -> bool:
     masks = {frame.mask.parent: frame.mask for frame in scene.frames if frame.mask is not None}  # one of each folder
     for parent, mask in masks.items():
         if parent.resolve().is_relative_to((path / OCCLUDERS).resolve()):
-            raise UserError(
-                f"{path} holds masks that this scene uses, such as {mask}; training would delete them",
-                "choose another folder with -o",
-            )
+            what = f"{path} holds masks that this scene uses, such as {mask}; training would delete them"
+            raise UserError(what, "choose another folder with -o")
     if task.resume and run.config.split_sha256 != split_hash(scene.test_names):
         before = run.config.holdout
         raise UserError(

@@ -8,7 +8,7 @@ from pathlib import Path
 from nerfcli.cameras import paths
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame, frames_named
-from nerfcli.cameras.framing import Window, cropped, equirectangular, sized, with_lens
+from nerfcli.cameras.framing import cropped, equirectangular, sized, with_lens
 from nerfcli.captures.formats.camera_path import find_camera_path, read_path
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.captures.loading import with_photos_on_disk
@@ -55,7 +55,7 @@ class PictureOptions:
             camera = sized(camera, self.width, self.height)
             if self.lens is not None:
                 camera = with_lens(camera, self.lens, self.fov_deg)
-        return camera if self.crop is None else cropped(camera, Window(*self.crop))
+        return camera if self.crop is None else cropped(camera, *self.crop)
 
 
 @dataclass(frozen=True)
@@ -93,9 +93,8 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
     """
     cameras, through = views.cameras, views.through
     if through is not None and cameras not in PATHS:
-        raise UserError(
-            f"--through cannot be used with --cameras {cameras}", f"it works with {', '.join(PATHS)}", exit_code=2
-        )
+        hint = f"it works with {', '.join(PATHS)}"
+        raise UserError(f"--through cannot be used with --cameras {cameras}", hint, exit_code=2)
     sets, factor = run.cameras, run.config.downscale
     keyframes = sets.train
     if through is not None:
@@ -118,10 +117,8 @@ def frames_of_file(views: Views) -> list[Frame]:
     """Return the frames of a file or folder of cameras: in a folder, those of the photos there, rescaled to them."""
     path = Path(views.cameras)
     if not path.exists():
-        raise UserError(
-            f"no cameras found at {path}",
-            f"give test, train, {', '.join(PATHS)}, or a file or folder of cameras that nerfcli convert reads",
-        )
+        hint = f"give test, train, {', '.join(PATHS)}, or a file or folder of cameras that nerfcli convert reads"
+        raise UserError(f"no cameras found at {path}", hint)
     form, found = recognise(path)
     capture = form.parse(found)
     if path.is_dir() and form.name != "run" and any(frame.has_photo for frame in capture.frames):

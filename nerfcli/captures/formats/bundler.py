@@ -96,11 +96,8 @@ def _counts(lines: list[Numbered], path: Path) -> tuple[int, int]:
     if not (cameras >= 0 and points >= 0 and cameras == int(cameras) and points == int(points)):
         raise malformed(where, f"announces {cameras:g} cameras and {points:g} points", "expected two whole numbers")
     if 1 + 5 * cameras + 3 * points != len(lines):
-        raise malformed(
-            where,
-            f"announces {cameras:.0f} cameras and {points:.0f} points, but the file has {len(lines)} lines",
-            "each camera has 5 lines and each point 3; the file is cut off or was changed",
-        )
+        what = f"announces {cameras:.0f} cameras and {points:.0f} points, but the file has {len(lines)} lines"
+        raise malformed(where, what, "each camera has 5 lines and each point 3; the file is cut off or was changed")
     return int(cameras), int(points)
 
 
@@ -118,11 +115,8 @@ def _find_list(path: Path) -> Path:
     for candidate in candidates:
         if candidate.is_file():
             return candidate
-    raise malformed(
-        path,
-        f"the list of images next to it is missing ({candidates[1]})",
-        "write one: the names of the photos in the order of the cameras, one per line",
-    )
+    hint = "write one: the names of the photos in the order of the cameras, one per line"
+    raise malformed(path, f"the list of images next to it is missing ({candidates[1]})", hint)
 
 
 def _listed(line: str, where: str) -> str:
@@ -157,9 +151,8 @@ def _points(
         words, _, where = _line(lines, 3 * index + 2, 0, path)
         count = numbers(words[:1], 1, where)[0]
         if count != (len(words) - 1) / 4:
-            raise malformed(
-                where, f"announces {count:g} views, but has {len(words) - 1} numbers", "expected 4 for each view"
-            )
+            hint = "expected 4 for each view"
+            raise malformed(where, f"announces {count:g} views, but has {len(words) - 1} numbers", hint)
         views += numbers(words[1:], len(words) - 1, where)
         owners += [index] * int(count)
     table = np.array(views, dtype=np.float64).reshape(-1, 4)

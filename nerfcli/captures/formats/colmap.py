@@ -55,10 +55,8 @@ def parse_colmap(model_dir: Path) -> Capture:
     try:
         return capture_of(model)
     except ValueError as error:
-        raise UserError(
-            f"{_file(model_dir, 'images')} and {_file(model_dir, 'points3D').name} do not belong together: {error}",
-            "the files come from different reconstructions; copy all of them again",
-        ) from error
+        what = f"{_file(model_dir, 'images')} and {_file(model_dir, 'points3D').name} do not belong together: {error}"
+        raise UserError(what, "the files come from different reconstructions; copy all of them again") from error
 
 
 def parse_model(model_dir: Path, given: UserInputs = UserInputs()) -> Capture:
@@ -138,9 +136,8 @@ def _parse(path: Path, reader: Callable[[bytes], T]) -> T:
             "digits, and reconstruct the model again",
         ) from error
     except (struct.error, ValueError, IndexError, KeyError) as error:
-        raise UserError(
-            f"{path} is damaged: {error}", "the file is truncated or was changed; copy or reconstruct the model again"
-        ) from error
+        hint = "the file is truncated or was changed; copy or reconstruct the model again"
+        raise UserError(f"{path} is damaged: {error}", hint) from error
     except UserError as error:
         raise UserError(f"{path}: {error.message}", error.hint) from error
 
@@ -180,10 +177,8 @@ def _write(capture: Capture, path: Path, suffix: str, *, wrong: list[str]) -> No
         raise UserError(f"{path} is a file", "give the folder of the model, such as sparse/0")
     others = {item.name for item in path.iterdir()} - set(MODEL_FILES) if path.is_dir() else set()
     if others:
-        raise UserError(
-            f"{path} contains files other than a COLMAP model, such as {min(others)}",
-            "use a separate folder, such as sparse/0 in it",
-        )
+        hint = "use a separate folder, such as sparse/0 in it"
+        raise UserError(f"{path} contains files other than a COLMAP model, such as {min(others)}", hint)
     encoding, model = _ENCODINGS[suffix], model_of(capture)
     with atomic_folder(path) as partial:
         (partial / f"cameras{suffix}").write_bytes(encoding.cameras_to_bytes(model))

@@ -38,20 +38,14 @@ def checked_camera(model: str, width: int, height: int, params: tuple[float, ...
         UserError: a size or parameter is invalid or beyond its limit; the message begins with `where`.
     """
     if max(width, height) > MOST_PIXELS:
-        raise UserError(
-            f"{where}: invalid size of a picture: {width:.12g}x{height:.12g} pixels",
-            f"width and height must be at most {MOST_PIXELS}",
-        )
+        hint = f"width and height must be at most {MOST_PIXELS}"
+        raise UserError(f"{where}: invalid size of a picture: {width:.12g}x{height:.12g} pixels", hint)
     if not all(abs(value) < MOST_PARAMETER for value in params):  # True at NaN
-        raise UserError(
-            f"{where}: invalid camera parameters {', '.join(f'{value:g}' for value in params)}",
-            f"every parameter must be a finite number below {MOST_PARAMETER:g}",
-        )
+        hint = f"every parameter must be a finite number below {MOST_PARAMETER:g}"
+        raise UserError(f"{where}: invalid camera parameters {', '.join(f'{value:g}' for value in params)}", hint)
     if model == "EQUIRECTANGULAR" and abs(width - 2 * height) > 1:
-        raise UserError(
-            f"{where}: invalid size of an EQUIRECTANGULAR picture: {width}x{height} pixels",
-            "a picture of the whole sphere is twice as wide as high; ordinary photos have another camera model",
-        )
+        hint = "a picture of the whole sphere is twice as wide as high; ordinary photos have another camera model"
+        raise UserError(f"{where}: invalid size of an EQUIRECTANGULAR picture: {width}x{height} pixels", hint)
     try:
         return Camera(model, width, height, params)
     except UserError as error:
@@ -74,10 +68,8 @@ def rigid_pose(matrix: np.ndarray, where: str) -> np.ndarray:
         raise UserError(f"{where}: {what}", "the pose of this image is invalid; remove its entry")
     if len(matrix) == 4 and not np.allclose(matrix[3], _LAST_ROW, rtol=0, atol=_MAX_DEVIATION):
         last = " ".join(f"{value:g}" for value in matrix[3])
-        raise UserError(
-            f"{where}: its last row is {last}, expected 0 0 0 1",
-            "the position is in the last column; write matrices row by row, not column by column",
-        )
+        hint = "the position is in the last column; write matrices row by row, not column by column"
+        raise UserError(f"{where}: its last row is {last}, expected 0 0 0 1", hint)
     rotation = matrix[:3, :3]
     bend = _bend(rotation)
     if bend > _MAX_DEVIATION:
@@ -196,10 +188,8 @@ def left_out(lost: Sequence[tuple[str, UserError]], count: int) -> tuple[str, ..
     remaining = count - len(lost)
     _, error = lost[0]
     if remaining < 2 or 2 * remaining < count:
-        raise UserError(
-            f"{error.message}; only {remaining} of {several(count, 'frame')} can be used",
-            f"at least 2, and half of them, are needed: {error.hint}",
-        )
+        hint = f"at least 2, and half of them, are needed: {error.hint}"
+        raise UserError(f"{error.message}; only {remaining} of {several(count, 'frame')} can be used", hint)
     names = listed([name for name, _ in lost])
     return (f"{len(lost)} of {several(count, 'frame')} left out: {names} ({error.message})",)
 

@@ -100,9 +100,8 @@ def _read_rows(path: Path) -> np.ndarray:
     except (OSError, ValueError) as error:
         raise UserError(f"{path} is not a readable NumPy array ({str(error)[:200]})", DAMAGED) from error
     if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0 or rows.dtype.kind not in "fiu":
-        raise UserError(
-            f"{path}: array of shape {rows.shape}", "expected (images, 17): 3x5 pose and intrinsics, near and far depth"
-        )
+        hint = "expected (images, 17): 3x5 pose and intrinsics, near and far depth"
+        raise UserError(f"{path}: array of shape {rows.shape}", hint)
     return rows.astype(np.float64)
 
 
@@ -111,10 +110,8 @@ def _cameras(path: Path, rows: np.ndarray, kept: Sequence[int]) -> list[Camera]:
     bad = [i for i in kept if not (0 < rows[i, 15] < rows[i, 16] and plausible(rows[i, 15:]))]
     if bad:
         near, far = rows[bad[0], 15:]
-        raise UserError(
-            f"{path}: row {bad[0]}: depth bounds {near:g} and {far:g}",
-            "expected 0 < near < far in the last two columns",
-        )
+        hint = "expected 0 < near < far in the last two columns"
+        raise UserError(f"{path}: row {bad[0]}: depth bounds {near:g} and {far:g}", hint)
     numbers = {index: tuple(rows[index, 4:15:5].tolist()) for index in kept}
     cameras = {row: _camera(row, f"{path}: row {index}") for index, row in reversed(numbers.items())}
     return [cameras[row] for row in numbers.values()]
@@ -127,18 +124,15 @@ def _photos_of_rows(path: Path, count: int, folders: Sequence[Path]) -> Sequence
         if len(photos) == count:
             return photos
         found.append(f"{folder.name}/ has {several(len(photos), 'photo')}")
-    raise UserError(
-        f"{path} has {count} rows, but {', '.join(found)}", "there must be exactly one photo per row, sorted by name"
-    )
+    hint = "there must be exactly one photo per row, sorted by name"
+    raise UserError(f"{path} has {count} rows, but {', '.join(found)}", hint)
 
 
 def _camera(size_and_focal: Iterable[float], where: str) -> Camera:
     height, width, focal = size_and_focal
     if not min(height, width) >= 1 or not focal > 0 or not max(height, width, focal) < np.inf:  # True at NaN
-        raise UserError(
-            f"{where}: invalid height, width or focal length: {height:g}, {width:g}, {focal:g}",
-            "expected three positive numbers in the fifth column of the pose",
-        )
+        hint = "expected three positive numbers in the fifth column of the pose"
+        raise UserError(f"{where}: invalid height, width or focal length: {height:g}, {width:g}, {focal:g}", hint)
     params = (focal, focal, round(width) / 2, round(height) / 2)
     return checked_camera("PINHOLE", round(width), round(height), params, where=where)
 

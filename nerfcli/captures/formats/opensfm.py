@@ -166,9 +166,8 @@ def _camera(value: Any, where: str) -> Camera:
         params = (*focal, *centre, *radial, k5, k6, *others)
         return checked_camera("RAD_TAN_THIN_PRISM_FISHEYE", *size, params, where=where)
     if k5 or k6 or s1 or s3:
-        raise malformed(
-            where, "k5, k6, s1 or s3 beside p1, p2, s0 or s2", "no supported camera model has all of these terms"
-        )
+        hint = "no supported camera model has all of these terms"
+        raise malformed(where, "k5, k6, s1 or s3 beside p1, p2, s0 or s2", hint)
     return lenses.fisheye_camera(size, focal, centre, radial=radial, tangential=(p1, p2), prism=(s0, s2), where=where)
 
 
@@ -178,10 +177,8 @@ def _camera_record(camera: Camera) -> dict[str, Any]:
     if camera.is_spherical:
         return {"projection_type": "spherical", **size}
     if camera.model in _NO_WORDS:
-        raise UserError(
-            f"camera model {camera.model} cannot be written to OpenSfM's reconstruction.json",
-            "write undistorted cameras, or keep the COLMAP model",
-        )
+        hint = "write undistorted cameras, or keep the COLMAP model"
+        raise UserError(f"camera model {camera.model} cannot be written to OpenSfM's reconstruction.json", hint)
     scale, value, (fx, fy), (cx, cy) = max(camera.size), camera.values, camera.focal_lengths, camera.principal_point
     intrinsics = {
         "focal_x": fx / scale,

@@ -151,9 +151,8 @@ def _refuse_other(best: Search, other: Search) -> None:
     for one, two in zip(best.paths, other.paths, strict=True):
         if one is not None and two is not None and not filecmp.cmp(one, two, shallow=False):
             seen = " and ".join(seen_from(best.place.home, path) for path in (one, two))
-            raise UserError(
-                f"two folders hold photos of these names: {seen}", "give the one that is meant with --images"
-            )
+            hint = "give the one that is meant with --images"
+            raise UserError(f"two folders hold photos of these names: {seen}", hint)
 
 
 def _described(names: Sequence[Name], search: Search | None) -> FoundPhotos:

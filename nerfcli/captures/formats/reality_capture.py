@@ -214,11 +214,8 @@ def _camera(value: dict[str, str], size: tuple[int, int], where: str, fits: Fits
     terms = dict(zip(_TERMS, numbers(words, 6, f"{where}: DistortionCoeficients"), strict=True))
     model = value.get("DistortionModel", "perspective").lower()
     if model not in _MODELS and any(terms.values()):
-        raise malformed(
-            where,
-            f"DistortionModel is {shown(model)}, which is not supported",
-            "set Alignment Settings > Advanced > Distortion model to Brown3, align, and export again",
-        )
+        hint = "set Alignment Settings > Advanced > Distortion model to Brown3, align, and export again"
+        raise malformed(where, f"DistortionModel is {shown(model)}, which is not supported", hint)
     intrinsics = {
         "f": number("FocalLength35mm", ""),
         "px": number("PrincipalPointU", "0"),

@@ -103,15 +103,11 @@ def recognise(path: Path) -> tuple[Format, Path]:
     if photos := photo_folder(path):
         above = path.parent if path.name else path.resolve().parent
         other = f"those of {in_shell(above)} are used if you give that folder, or " if recognised(above) else ""
-        raise UserError(
-            f"{photos} has {several(len(list_images(photos)), 'photo')} but no cameras",
-            f"{other}estimate them with: nerfcli poses {in_shell(photos)}",
-        )
+        hint = f"{other}estimate them with: nerfcli poses {in_shell(photos)}"
+        raise UserError(f"{photos} has {several(len(list_images(photos)), 'photo')} but no cameras", hint)
     usual = ", ".join(form.looked_for for form in FORMATS if form.name in ("nerfcli", "colmap", "transforms"))
-    raise UserError(
-        f"{path} contains no capture in a supported format",
-        f"looked for {usual} and the files of many more programs: nerfcli convert --help lists them",
-    )
+    hint = f"looked for {usual} and the files of many more programs: nerfcli convert --help lists them"
+    raise UserError(f"{path} contains no capture in a supported format", hint)
 
 
 def _captures_in(path: Path) -> list[Path]:
@@ -175,10 +171,8 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
         for f in capture.frames
     ]
     if not any(found):
-        raise UserError(
-            f"{folder} contains no mask for any of the {len(found)} photos",
-            "masks are named after the photos: IMG_1.jpg.png, IMG_1.png or IMG_1_mask.png for IMG_1.jpg",
-        )
+        hint = "masks are named after the photos: IMG_1.jpg.png, IMG_1.png or IMG_1_mask.png for IMG_1.jpg"
+        raise UserError(f"{folder} contains no mask for any of the {len(found)} photos", hint)
     for frame, mask in zip(capture.frames, found, strict=True):
         if mask is not None and frame.image is not None and mask.resolve() == frame.image.resolve():
             raise UserError(f"{folder} contains photos, such as {frame.name}", "give a folder that has only masks")

@@ -101,9 +101,8 @@ def _read_frames(path: Path, *, given: bool) -> RunCameras:
         )
         exposures = PhotoExposures(**content[_EXPOSURES])
     except FileNotFoundError as error:
-        raise UserError(
-            f"{run} is not a run folder: it has no {CAMERAS}", "give a run folder written by nerfcli train"
-        ) from error
+        hint = "give a run folder written by nerfcli train"
+        raise UserError(f"{run} is not a run folder: it has no {CAMERAS}", hint) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} cannot be read: {error}", REPAIR_HINT) from error
     return RunCameras(train, test, exposures)

@@ -250,10 +250,8 @@ def _named(capture: Capture) -> tuple[Path, list[str]]:
     images = []
     for frame in capture.frames:
         if frame.image is None:
-            raise UserError(
-                f"{frame.name} has no photo, which a scene requires",
-                "give the photo folder with --images, or convert to another format",
-            )
+            hint = "give the photo folder with --images, or convert to another format"
+            raise UserError(f"{frame.name} has no photo, which a scene requires", hint)
         images.append(os.path.abspath(frame.image))
     names = [frame.name for frame in capture.frames]
     first = names[0].split("/")

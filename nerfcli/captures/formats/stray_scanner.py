@@ -44,9 +44,8 @@ def parse_stray_scanner(folder: Path, given: UserInputs = UserInputs()) -> Captu
         video = open_video(path_of_video)
         size = video.width, video.height
     else:
-        raise malformed(
-            folder, f"has neither photos nor the video {_VIDEOS[0]}", f"copy the whole capture; {GIVE_PHOTOS}"
-        )
+        hint = f"copy the whole capture; {GIVE_PHOTOS}"
+        raise malformed(folder, f"has neither photos nor the video {_VIDEOS[0]}", hint)
     has_lenses = all(key in row for row, _ in rows.values() for key in _LENS)
     matrix = np.eye(3) if has_lenses else _matrix(folder / MATRIX)
     fits, poses, frames = Fits(), FramePoses(), []

@@ -183,9 +183,8 @@ def given_size(record: dict[str, Any], where: str) -> tuple[int, int] | None:
     if width is None or height is None:
         return None
     if width < 1 or height < 1 or width != int(width) or height != int(height):
-        raise malformed(
-            where, f"w and h are {width} and {height}", "expected the picture's size in pixels, as integers"
-        )
+        hint = "expected the picture's size in pixels, as integers"
+        raise malformed(where, f"w and h are {width} and {height}", hint)
     return int(width), int(height)
 
 

@@ -92,9 +92,8 @@ def _own_camera(folder: Path, size: tuple[int, int]) -> Camera:
     elif sequence is not None:
         where, params, size = str(folder), _KINECTS[sequence[1]], _KINECT_SIZE
     else:
-        raise UserError(
-            f"{folder}: a sequence of TUM RGB-D without {_CALIBRATIONS[0]}, and not of freiburg1, 2 or 3", GIVE_CAMERA
-        )
+        what = f"{folder}: a sequence of TUM RGB-D without {_CALIBRATIONS[0]}, and not of freiburg1, 2 or 3"
+        raise UserError(what, GIVE_CAMERA)
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = (*params, *[0.0] * (9 - len(params)))
     return lenses.brown_camera(size, (fx, fy), (cx, cy), radial=(k1, k2, k3), tangential=(p1, p2), where=where)
 

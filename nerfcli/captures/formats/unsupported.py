@@ -70,7 +70,5 @@ def refuse_spherical(capture: Capture, what: str) -> None:
     """Refuse a capture with a spherical picture, which has no focal length or field of view, for a format of these."""
     for frame in capture.frames:
         if frame.camera.is_spherical:
-            raise UserError(
-                f"the spherical picture {frame.name} has no {what}, which this format requires",
-                "write transforms.json instead",
-            )
+            hint = "write transforms.json instead"
+            raise UserError(f"the spherical picture {frame.name} has no {what}, which this format requires", hint)
