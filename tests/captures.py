@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
@@ -77,6 +78,12 @@ def ring(
     observations = Observations(np.array(frame_index), np.array(point_index), np.array(pixels).reshape(-1, 2))
     colours = rng.integers(1, 256, size=(num_points, 3), dtype=np.uint8)
     return Capture(tuple(frames), points, (), None, "colmap", colours=colours, observations=observations)
+
+
+def random_similarity(rng: np.random.Generator, scale: float | None = None) -> rigid.Similarity:
+    """Return a random similarity, of a random scale from 0.001 to 1000 unless it is given."""
+    scale = 10.0 ** rng.uniform(-3, 3) if scale is None else scale
+    return rigid.Similarity(scale, Rotation.from_quat(rng.normal(size=4)).as_matrix(), scale * rng.normal(size=3))
 
 
 def photograph(frames: Sequence[Frame]) -> None:

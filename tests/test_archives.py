@@ -38,6 +38,14 @@ def packed(folder: Path, path: Path, *, inside: str = "") -> Path:
     return path
 
 
+def zipped(path: Path, *entries: str | zipfile.ZipInfo, content: str | bytes = "a") -> Path:
+    """Pack files of the same content."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for each in entries:
+            archive.writestr(each, content)
+    return path
+
+
 def unpack(path: Path, result: Path, *, overwrite: bool = False) -> Path:
     return unpacked(path, Output(result, overwrite), reporter=Reporter())
 
@@ -95,18 +103,13 @@ def test_another_archive_of_this_name_replaces_the_files_only_if_it_may(tmp_path
 
 
 def test_separators_of_windows_are_read(tmp_path):
-    path = tmp_path / "scan.zip"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr(entry("scan\\images\\a.txt"), "good")
-    folder = unpack(path, tmp_path / "scene")
+    folder = unpack(zipped(tmp_path / "scan.zip", entry("scan\\images\\a.txt"), content="good"), tmp_path / "scene")
     assert (folder / "a.txt").read_text() == "good"
     assert folder == tmp_path / "scan-unpacked/scan/images"
 
 
 def test_an_archive_in_an_archive_is_named(tmp_path):
-    path = tmp_path / "outer.zip"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr(entry("scan/inner.zip"), "")
+    path = zipped(tmp_path / "outer.zip", entry("scan/inner.zip"), content="")
     with pytest.raises(UserError, match=r"outer\.zip contains only archives, such as scan/inner\.zip"):
         unpack(path, tmp_path / "scene")
     assert not (tmp_path / "outer-unpacked").exists()
@@ -116,10 +119,7 @@ def test_an_archive_in_an_archive_is_named(tmp_path):
     "name", ["../out.txt", "a/../../out.txt", "/tmp/out.txt", "C:/out.txt", "..\\out.txt", "a\nb.txt", "\\\\host\\out"]
 )
 def test_names_that_lead_elsewhere_are_refused(tmp_path, name):
-    path = tmp_path / "bad.zip"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr(entry("good.txt"), "good")
-        archive.writestr(entry(name), "bad")
+    path = zipped(tmp_path / "bad.zip", entry("good.txt"), entry(name))
     with pytest.raises(UserError, match="is not safe to unpack: it has a file named") as caught:
         unpack(path, tmp_path / "results/scene")
     assert caught.value.exit_code == BAD_INPUT
@@ -133,14 +133,9 @@ def test_links_encrypted_files_and_equal_names_are_refused(tmp_path):
         ([entry("a/B.txt"), entry("a/b.txt")], "a/b.txt is in it twice"),
         ([], "contains no files"),
     ):
-        with zipfile.ZipFile(path, "w") as archive:
-            for each in made:
-                archive.writestr(each, "/etc")
         with pytest.raises(UserError, match=what):
-            unpack(path, tmp_path / "scene")
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("a.txt", "a")
-    data = bytearray(path.read_bytes())
+            unpack(zipped(path, *made, content="/etc"), tmp_path / "scene")
+    data = bytearray(zipped(path, "a.txt").read_bytes())
     data[6] |= 1  # bit 0 of the flags, in both headers
     data[data.index(b"PK\x01\x02") + 8] |= 1
     path.write_bytes(data)
@@ -150,9 +145,7 @@ def test_links_encrypted_files_and_equal_names_are_refused(tmp_path):
 
 def test_a_compression_that_is_not_supported_is_not_called_damage(tmp_path):
     """Explorer packs files of more than 2 GB with Deflate64, method 9."""
-    path = tmp_path / "walk.zip"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("a.txt", "a")
+    path = zipped(tmp_path / "walk.zip", "a.txt")
     data = bytearray(path.read_bytes())
     data[8] = data[data.index(b"PK\x01\x02") + 10] = 9
     path.write_bytes(data)
@@ -163,10 +156,7 @@ def test_a_compression_that_is_not_supported_is_not_called_damage(tmp_path):
 
 
 def test_a_bomb_is_refused_before_anything_is_written(tmp_path):
-    path = tmp_path / "bomb.zip"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for index in range(11):
-            archive.writestr(f"{index}.txt", bytes(10 << 20))
+    path = zipped(tmp_path / "bomb.zip", *(f"{index}.txt" for index in range(11)), content=bytes(10 << 20))
     assert path.stat().st_size < 200_000  # 115 MB of zeros
     with pytest.raises(UserError, match=r"is not safe to unpack: it claims to hold 11 files \(0.1 GB\) in 0.1 MB"):
         unpack(path, tmp_path / "scene")
@@ -174,17 +164,14 @@ def test_a_bomb_is_refused_before_anything_is_written(tmp_path):
 
 
 def test_sizes_that_are_stated_too_small_and_full_disks_leave_nothing(tmp_path, monkeypatch):
-    path = tmp_path / "liar.zip"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("a.txt", bytes(1 << 20))
+    path = zipped(tmp_path / "liar.zip", "a.txt", content=bytes(1 << 20))
     data = bytearray(path.read_bytes())
     place = data.index(b"PK\x01\x02") + 24  # the size in the central directory
     data[place : place + 4] = (1000).to_bytes(4, "little")
     path.write_bytes(data)
     with pytest.raises(UserError, match=r"liar.zip is not a readable zip archive"):
         unpack(path, tmp_path / "scene")
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("a.txt", "abc")
+    zipped(path, "a.txt", content="abc")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Disk(free=2))
     with pytest.raises(UserError, match=r"would need 0.0 GB, and .* has only 0.0 GB"):
         unpack(path, tmp_path / "scene")
@@ -202,11 +189,8 @@ def test_a_truncated_archive_is_refused_and_leaves_nothing(tmp_path, share):
 
 
 def test_what_systems_add_is_left_out(tmp_path):
-    path = tmp_path / "mac.zip"
-    with zipfile.ZipFile(path, "w") as archive:
-        for name in ("walk/a.txt", "__MACOSX/walk/._a.txt", "walk/.DS_Store", "walk/._a.txt"):
-            archive.writestr(name, "a")
-    folder = unpack(path, tmp_path / "scene")
+    names = ("walk/a.txt", "__MACOSX/walk/._a.txt", "walk/.DS_Store", "walk/._a.txt")
+    folder = unpack(zipped(tmp_path / "mac.zip", *names), tmp_path / "scene")
     assert [item.name for item in folder.iterdir()] == ["a.txt"]
 
 

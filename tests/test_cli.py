@@ -148,10 +148,9 @@ def test_every_command_line_of_a_guide_parses(guide):
         check_that_it_parses(line)
 
 
-def test_the_readme_is_short_and_has_an_example_of_every_command():
+def test_the_readme_has_an_example_of_every_command():
     lines = command_lines(GUIDES[0])
     assert {line.split("nerfcli ")[1].split()[0] for line in lines} >= {*COMMANDS, *WITHOUT_INPUT, "report", "ablate"}
-    assert len(GUIDES[0].read_text(encoding="utf-8").splitlines()) <= 150
 
 
 @pytest.mark.parametrize("guide", [*GUIDES, PROJECT / "CONTRIBUTING.md"], ids=lambda guide: guide.name)

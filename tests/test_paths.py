@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from captures import random_similarity
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
@@ -114,9 +115,7 @@ def test_orbit_of_a_ring_is_that_ring(seed, turns, height):
     """In any frame of the world: at the cameras' own distance and elevation, closed, constant in speed, looking in."""
     rng = np.random.default_rng(seed)
     focus = rng.normal(size=3)
-    similarity = Similarity(
-        10.0 ** rng.uniform(-2, 2), Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3)
-    )
+    similarity = random_similarity(rng)
     frames = moved(ring(focus, height=height, turns=turns), similarity)
     path = orbit(frames, count=40)
     size, focus = similarity.scale, similarity.apply(focus)
@@ -161,9 +160,7 @@ def test_orbit_of_an_elongated_ring_is_its_ellipse():
 def test_an_ellipse_through_cameras_on_an_ellipse_is_that_ellipse(seed):
     """In any frame of the world: the path is the cameras' own ellipse, but for the percentile that sets its axes."""
     rng = np.random.default_rng(seed)
-    similarity = Similarity(
-        10.0 ** rng.uniform(-2, 2), Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3)
-    )
+    similarity = random_similarity(rng)
     a, b = 3.0, 2.0
     angle = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     # 90 % of |cos| are below cos(0.05 pi): the ellipse is smaller than the cameras' by that.

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from captures import random_similarity
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,11 +22,6 @@ few = examples(40)
 
 def random_pose(rng: np.random.Generator, size: float = 1.0) -> np.ndarray:
     return rigid.from_parts(Rotation.from_quat(rng.normal(size=4)).as_matrix(), size * rng.normal(size=3))
-
-
-def random_similarity(rng: np.random.Generator) -> Similarity:
-    scale = 10.0 ** rng.uniform(-3, 3)
-    return Similarity(scale, Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3) * scale)
 
 
 @given(seed=seeds, exponent=exponents)

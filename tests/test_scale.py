@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from captures import random_similarity
 from commands import completed
 from examples import examples
 from hypothesis import given
@@ -47,11 +48,6 @@ from nerfcli.photos.images import write_png
 
 few = examples(20)
 seeds = st.integers(0, 2**32 - 1)
-
-
-def random_similarity(rng: np.random.Generator) -> Similarity:
-    scale = 10.0 ** rng.uniform(-2, 2)
-    return Similarity(scale, Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3) * scale)
 
 
 def frames_at(centres: np.ndarray) -> list[Frame]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from captures import put_photos
+from captures import put_photos, random_similarity
 from examples import examples
 from frame_rays import frame_rays
 from hypothesis import given
@@ -49,10 +49,6 @@ def capture_of(rng: np.random.Generator, *, count: int = 8, unit: str = "arbitra
     bounds = np.stack([depths.min(axis=1), depths.max(axis=1)], axis=1)
     colours = rng.integers(0, 256, (20, 3)).astype(np.uint8)
     return Capture(frames, points, ("gone.jpg",), bounds, "test", colours, seen, unit)
-
-
-def random_similarity(rng: np.random.Generator, scale: float) -> Similarity:
-    return Similarity(scale, Rotation.from_quat(rng.normal(size=4)).as_matrix(), scale * rng.normal(size=3))
 
 
 def pixels_of(capture: Capture) -> np.ndarray:
