@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import pytest
 import typer.main
+from captures import put_photos
 from commands import completed, error_of, estimated_poses, listing, nerfcli, refusal, started
-from PIL import Image
 from present import present
 from typer.exceptions import TyperException
 
@@ -85,10 +85,7 @@ def stop_at(monkeypatch) -> Callable[..., list[tuple[tuple[Any, ...], dict[str, 
 
 
 def write_photos(folder: Path, count: int) -> Path:
-    folder.mkdir(parents=True)
-    for index in range(count):
-        pixels = np.random.default_rng(index).integers(0, 256, (48, 64, 3)).astype(np.uint8)
-        Image.fromarray(pixels).save(folder / f"photo {index}.jpg", quality=95)
+    put_photos(folder, *(f"photo {index}.jpg" for index in range(count)), noise=True)
     return folder
 
 

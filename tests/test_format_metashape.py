@@ -177,14 +177,19 @@ def test_of_components_without_a_common_world_the_largest_is_read(tmp_path):
     assert capture.notes == ()
 
 
-def test_of_several_chunks_that_with_most_aligned_cameras_is_read(tmp_path):
-    first, second, third = (
+def chunks_of(*counts: int) -> list[str]:
+    """Return chunks of so many cameras, whose names begin with a, b, ..."""
+    texts = [
         document(sensor_xml({"f": 500.0}), "".join(camera_xml(f"{key} {i}") for i in range(count)))
-        for key, count in (("a", 1), ("b", 3), ("c", 2))
-    )
-    unaligned = second.replace("<cameras>", "<cameras>" + camera_xml("x", pose=None))
-    between = [text[text.index("<chunk") : text.index("</document>")] for text in (unaligned, third)]
-    capture = parse_metashape(write(tmp_path, first.replace("</document>", "".join(between) + "</document>")))
+        for key, count in zip("abc", counts, strict=False)
+    ]
+    return [text[text.index("<chunk") : text.index("</document>")] for text in texts]
+
+
+def test_of_several_chunks_that_with_most_aligned_cameras_is_read(tmp_path):
+    first, second, third = chunks_of(1, 3, 2)
+    first = first.replace("</cameras>", 3 * camera_xml("x", pose=None) + "</cameras>")
+    capture = parse_metashape(write(tmp_path, f"<document>{first}{second}{third}</document>"))
     assert [frame.name for frame in capture.frames] == ["b 0", "b 1", "b 2"]
     others = "others, which are in other coordinates: 1 (Chunk 1) with 1, 3 (Chunk 1) with 2"
     assert capture.notes[0] == f"chunk 2 (Chunk 1) with 3 cameras is read; {others}"
@@ -194,12 +199,8 @@ def test_of_several_chunks_that_with_most_aligned_cameras_is_read(tmp_path):
     "off", [('<chunk label="Chunk 1" enabled="true">', '<chunk enabled="0">'), ("<camera ", '<camera enabled="false" ')]
 )
 def test_a_disabled_chunk_and_one_of_disabled_cameras_are_not_read_before_another(off, tmp_path):
-    first, second = (
-        document(sensor_xml({"f": 500.0}), "".join(camera_xml(f"{key} {i}") for i in range(count)))
-        for key, count in (("a", 2), ("b", 3))
-    )
-    second = second[second.index("<chunk") :].replace(*off)
-    capture = parse_metashape(write(tmp_path, first.replace("</document>", second)))
+    first, second = chunks_of(2, 3)
+    capture = parse_metashape(write(tmp_path, f"<document>{first}{second.replace(*off)}</document>"))
     assert [frame.name for frame in capture.frames] == ["a 0", "a 1"]
     assert capture.notes[0].startswith("chunk 1 (Chunk 1) with 2 cameras is read; others")
 

@@ -729,25 +729,23 @@ def test_a_fisheye_with_tangential_terms_is_a_thin_prism_fisheye(tmp_path):
 # Masks, groups
 
 
-def test_masks_that_are_missing_are_left_out_and_named(tmp_path):
-    content = written(tmp_path)
-    photos(tmp_path, ["masks/0.png"])
-    for frame, mask in zip(content["frames"], ("C:\\x\\masks\\0.png", "masks/1.png", "", None), strict=False):
-        frame["mask_path"] = mask
-    capture = read_again(tmp_path, content)
-    assert [frame.mask for frame in capture.frames] == [tmp_path / "masks/0.png", *[None] * (COUNT - 1)]
-    assert capture.notes == ("1 mask named in transforms.json left out, not found: masks/1.png",)
-
-
-@pytest.mark.parametrize("on_disk", ["masks/0.jpg.png", "masks/0_mask.png"])
-def test_masks_that_are_named_after_the_photo_are_found(on_disk, tmp_path):
-    photos(tmp_path, [*numbered("{}.jpg"), on_disk])
-    content = transforms_record(numbered("{}.jpg"))
-    for frame, mask in zip(content["frames"], ("masks\\0.jpg", "1.jpg", "/"), strict=False):
+@pytest.mark.parametrize(
+    ("photo", "on_disk", "listed", "lost"),
+    [
+        ("{}.png", "masks/0.png", ("C:\\x\\masks\\0.png", "masks/1.png", "", None), "masks/1.png"),
+        # Named after the photo.
+        ("{}.jpg", "masks/0.jpg.png", ("masks\\0.jpg", "1.jpg", "/"), "1.jpg"),
+        ("{}.jpg", "masks/0_mask.png", ("masks\\0.jpg", "1.jpg", "/"), "1.jpg"),
+    ],
+)
+def test_masks_under_other_names_and_those_that_are_missing(photo, on_disk, listed, lost, tmp_path):
+    photos(tmp_path, [*numbered(photo), on_disk])
+    content = transforms_record(numbered(photo))
+    for frame, mask in zip(content["frames"], listed, strict=False):
         frame["mask_path"] = mask
     capture = read_again(tmp_path, content)
     assert [frame.mask for frame in capture.frames] == [tmp_path / on_disk, *[None] * (COUNT - 1)]
-    assert capture.notes == ("1 mask named in transforms.json left out, not found: 1.jpg",)
+    assert capture.notes == (f"1 mask named in transforms.json left out, not found: {lost}",)
 
 
 def test_masks_are_found_by_the_photos_as_they_are_on_disk(tmp_path):
