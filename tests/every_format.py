@@ -168,25 +168,16 @@ def write_record3d(views: Views, folder: Path) -> Path:
 
 
 def write_alicevision(views: Views, folder: Path) -> Path:
-    width, height = map(str, views.camera.size)
+    (width, height), (fx, fy, cx, cy) = views.camera.size, views.camera.params
     frames = views.frames(folder)
-    fx, fy, cx, cy = views.camera.params
-    lens = {
-        "intrinsicId": "77",
-        "width": width,
-        "height": height,
-        "sensorWidth": "36",
-        "sensorHeight": "24",
-        "type": "radial3",
-        "focalLength": repr(fx * 36 / views.camera.width),
-        "pixelRatio": repr(fy / fx),
-        "principalPoint": [repr(cx - views.camera.width / 2), repr(cy - views.camera.height / 2)],
-        "distortionParams": ["0", "0", "0"],
-    }
+    lens = {"width": str(width), "height": str(height), "sensorWidth": "36", "sensorHeight": "24"}
+    lens |= {"focalLength": repr(fx * 36 / width), "pixelRatio": repr(fy / fx)}
+    centre = [repr(cx - width / 2), repr(cy - height / 2)]
+    distortion = {"type": "radial3", "distortionParams": ["0", "0", "0"]}
     content = {
         "version": ["1", "2", "6"],
         "views": [{"poseId": f.name, "intrinsicId": "77", "path": str(f.image)} for f in frames],
-        "intrinsics": [lens],
+        "intrinsics": [{"intrinsicId": "77", **lens, "principalPoint": centre, **distortion}],
         "poses": [
             {"poseId": f.name, "pose": {"transform": {"rotation": numbers(p[:3, :3]).split(), "center": c.split()}}}
             for f, p, c in ((f, f.world_from_cam, numbers(f.centre)) for f in frames)

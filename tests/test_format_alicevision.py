@@ -16,24 +16,12 @@ from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.registry import recognise
 
 # Written by Meshroom 2023: focal length and sensor in millimetres, 6.3 mm / 9 mm * 640 px = 448 px.
-LENS = {
-    "intrinsicId": "77",
-    "width": "640",
-    "height": "480",
-    "sensorWidth": "9",
-    "sensorHeight": "6.75",
-    "serialNumber": "x",
-    "type": "radial3",
-    "initializationMode": "estimated",
-    "initialFocalLength": "6",
-    "focalLength": "6.3",
-    "pixelRatio": "1",
-    "pixelRatioLocked": "true",
-    "principalPoint": ["-3.5", "2.25"],
-    "distortionParams": ["0.08", "-0.11", "0.03"],
-    "undistortionParams": "",
-    "locked": "false",
-}
+LENS = (
+    {"intrinsicId": "77", "width": "640", "height": "480", "sensorWidth": "9", "sensorHeight": "6.75"}
+    | {"serialNumber": "x", "type": "radial3", "initializationMode": "estimated", "initialFocalLength": "6"}
+    | {"focalLength": "6.3", "pixelRatio": "1", "pixelRatioLocked": "true", "principalPoint": ["-3.5", "2.25"]}
+    | {"distortionParams": ["0.08", "-0.11", "0.03"], "undistortionParams": "", "locked": "false"}
+)
 WITHOUT_TERMS = {"distortionParams": ["0", "0", "0"]}
 ROTATIONS = Rotation.from_rotvec([[0.1, -0.4, 0.2], [1.3, 0.2, -0.7]]).as_matrix()
 CENTRES = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 2.0]])

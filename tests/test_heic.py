@@ -54,26 +54,13 @@ def test_the_picture_is_turned_once(tmp_path: Path, orientation: int, tile_size:
 
 
 def test_its_exif_is_that_of_a_jpeg(tmp_path: Path):
-    exif = exif_with({ExifTags.Base.Make: "Apple", ExifTags.Base.Model: "iPhone 13 Pro Max"})
-    exif.get_ifd(ExifTags.IFD.Exif).update(
-        {
-            ExifTags.Base.FocalLength: 5.7,
-            ExifTags.Base.FocalLengthIn35mmFilm: 26,
-            ExifTags.Base.ExposureTime: 1 / 100,
-            ExifTags.Base.ISOSpeedRatings: 80,
-            ExifTags.Base.DateTimeOriginal: "2026:11:27 10:00:00",
-            ExifTags.Base.ExifImageWidth: WIDTH,
-            ExifTags.Base.ExifImageHeight: HEIGHT,
-        }
-    )
-    exif.get_ifd(ExifTags.IFD.GPSInfo).update(
-        {
-            ExifTags.GPS.GPSLatitudeRef: "N",
-            ExifTags.GPS.GPSLatitude: (43.0, 39.0, 0.0),
-            ExifTags.GPS.GPSLongitudeRef: "W",
-            ExifTags.GPS.GPSLongitude: (79.0, 23.0, 0.0),
-        }
-    )
+    tags, gps = ExifTags.Base, ExifTags.GPS
+    phone = {tags.Make: "Apple", tags.Model: "iPhone 13 Pro Max"}
+    shot = {tags.FocalLength: 5.7, tags.FocalLengthIn35mmFilm: 26, tags.ExposureTime: 1 / 100, tags.ISOSpeedRatings: 80}
+    file = {tags.DateTimeOriginal: "2026:11:27 10:00:00", tags.ExifImageWidth: WIDTH, tags.ExifImageHeight: HEIGHT}
+    north = {gps.GPSLatitudeRef: "N", gps.GPSLatitude: (43.0, 39.0, 0.0)}
+    west = {gps.GPSLongitudeRef: "W", gps.GPSLongitude: (79.0, 23.0, 0.0)}
+    exif = exif_with(phone, {ExifTags.IFD.Exif: shot | file, ExifTags.IFD.GPSInfo: north | west})
     pixels = noise(HEIGHT, WIDTH, 3)
     Image.fromarray(pixels).save(tmp_path / "a.jpg", exif=exif)
     found = read_exif(write_heic(tmp_path / "b.heic", pixels, exif=exif.tobytes()))
