@@ -656,10 +656,8 @@ def test_several_runs_are_evaluated_in_one_call(finished, tmp_path):
     other = tmp_path / "other-run"
     shutil.copytree(finished, other)
     result = nerfcli("evaluate", finished, other, "--require", "psnr>=99")
-    assert (result.exit_code, result.stdout) == (
-        GATE_NOT_MET,
-        "".join(f"{run / 'metrics.json'}\n" for run in (finished, other)),
-    )
+    written = "".join(f"{run / 'metrics.json'}\n" for run in (finished, other))
+    assert (result.exit_code, result.stdout) == (GATE_NOT_MET, written)
     for run in (finished, other):
         assert f"Error: {run} does not meet --require psnr>=99" in result.stderr
 
@@ -793,12 +791,8 @@ def test_run_makes_no_splats_of_panoramas(monkeypatch, capture, tmp_path):
     """Stages with their arguments; a panorama is a camera of the run."""
     stages = []
     sphere = SimpleNamespace(camera=SimpleNamespace(is_spherical=True))
-    run = SimpleNamespace(
-        path=tmp_path / "run",
-        metrics_path=tmp_path / "run" / "metrics.json",
-        cameras=SimpleNamespace(train=[sphere]),
-        checkpoint_sha256=lambda: "",
-    )
+    files = {"path": tmp_path / "run", "metrics_path": tmp_path / "run" / "metrics.json"}
+    run = SimpleNamespace(cameras=SimpleNamespace(train=[sphere]), checkpoint_sha256=lambda: "", **files)
     monkeypatch.setattr(pipeline, "train_scene", lambda *given, **more: run)
     monkeypatch.setattr(pipeline, "usual_depth", lambda run, views: DepthRequest("conditional", "z"))
     for stage in ("evaluate_run", "evaluate_splats", "export_run", "report_runs"):

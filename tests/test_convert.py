@@ -433,10 +433,7 @@ def test_the_message_names_what_most_captures_have_and_the_command_that_lists_th
 
 def test_help_names_all_formats():
     text = nerfcli("convert", "--help").stdout
-    written, read = (
-        text.split("Formats written:")[1].split("Inside")[0],
-        text.split("Formats read:")[1].split("Formats w")[0],
-    )
+    read, written = text.split("Formats read:")[1].split("Inside")[0].split("Formats written:")
     intrinsics = text.rsplit("--intrinsics", 1)[1].split("--world-up")[0].replace("│", "")
     for form in FORMATS:
         assert (form.write is None) == (form.name not in FORMATS_WRITTEN)

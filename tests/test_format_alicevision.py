@@ -64,10 +64,8 @@ def test_poses_are_world_from_camera_by_rows_and_names_are_relative(tmp_path):
     assert (capture.kind, capture.unit, len(capture.points)) == ("alicevision", "arbitrary", 0)
     (tmp_path / "photos").mkdir()
     elsewhere = parse_alicevision(write(tmp_path, content()), UserInputs(tmp_path / "photos"))
-    assert [frame.image for frame in elsewhere.frames] == [
-        tmp_path / "photos/day 1/a.jpg",
-        tmp_path / "photos/day 2/a.jpg",
-    ]
+    photos = [tmp_path / "photos/day 1/a.jpg", tmp_path / "photos/day 2/a.jpg"]
+    assert [frame.image for frame in elsewhere.frames] == photos
 
 
 def test_photos_are_used_where_the_file_says_if_they_are_there(tmp_path):

@@ -101,9 +101,8 @@ def test_features_whose_points_are_gone(tmp_path):
     write_colmap_text(capture, tmp_path / "model")
     lines = (tmp_path / "model/points3D.txt").read_text().splitlines()
     (tmp_path / "model/points3D.txt").write_text("\n".join(lines[:-1]))
-    with pytest.raises(
-        UserError, match=r"images\.txt and points3D\.txt .* a feature refers to point 40, which does not"
-    ):
+    what = r"images\.txt and points3D\.txt .* a feature refers to point 40, which does not"
+    with pytest.raises(UserError, match=what):
         parse_colmap(tmp_path / "model")
     (tmp_path / "model/points3D.txt").write_text("\n".join([*lines, lines[-1]]))
     with pytest.raises(UserError, match=r"points3D\.txt .*: two points have the id 40"):

@@ -93,11 +93,8 @@ def test_names_photos_and_a_line_before_the_header(tmp_path):
     plain = {**dict.fromkeys(LENS, 0), "f": 36.0}
     rows = (row("b c.jpg", lens=plain), row('"ü, 2.jpg"', lens=plain), row("gone.jpg"), row("on.jpg", lens=plain), "")
     capture = parse_reality_capture(write(tmp_path, *rows, header=f"#cameras 4\n{OLD}"), UserInputs(images))
-    assert [(frame.name, frame.image) for frame in capture.frames] == [
-        ("b c.jpg", images / "b c.jpg"),
-        ("ü, 2.jpg", images / "ü, 2.jpg"),
-        ("on.jpg", images / "on.jpg"),
-    ]
+    names = ("b c.jpg", "ü, 2.jpg", "on.jpg")
+    assert [(frame.name, frame.image) for frame in capture.frames] == [(name, images / name) for name in names]
     assert capture.missing == ("gone.jpg",)
     assert (capture.kind, capture.unit) == ("reality_capture", "arbitrary")
     # The last photo is stored sideways, 64 x 48, and its camera refers to this orientation.

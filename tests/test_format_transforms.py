@@ -234,12 +234,8 @@ def test_names_and_sizes_without_the_photos(tmp_path):
         parse_transforms(path)
     put_photos(tmp_path, "images/no_suffix.JPG")
     capture = parse_transforms(path)
-    assert [frame.name for frame in capture.frames] == [
-        "images/a b.jpg",
-        "images/no_suffix.JPG",
-        "images/gone",
-        "x.png",
-    ]
+    expected = ["images/a b.jpg", "images/no_suffix.JPG", "images/gone", "x.png"]
+    assert [frame.name for frame in capture.frames] == expected
     assert capture.frames[0].image == tmp_path / "images/a b.jpg"
     assert {frame.camera for frame in capture.frames} == {Camera.pinhole(64, 48, 32 / math.tan(0.5))}
 

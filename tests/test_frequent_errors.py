@@ -53,10 +53,8 @@ def test_the_folder_around_a_capture_is_given(command, tmp_path):
         f"Hint:  there is one in {one}: give that folder",
     )
     shutil.copytree(one, tmp_path / "two")
-    assert (
-        error_of(nerfcli(command, tmp_path))[1]
-        == f"Hint:  there is one in {one} and in 1 other folder: give that folder"
-    )
+    hint = f"Hint:  there is one in {one} and in 1 other folder: give that folder"
+    assert error_of(nerfcli(command, tmp_path))[1] == hint
 
 
 def test_the_folder_of_photos_in_a_capture_is_given(tmp_path):

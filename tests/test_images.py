@@ -503,23 +503,14 @@ def test_downscale_refuses_to_enlarge():
 
 def test_exif_of_a_phone(tmp_path):
     path = tmp_path / "phone.jpg"
-    camera = {
-        ExifTags.Base.LensModel: "Lens 4 mm f/1.8",
-        ExifTags.Base.FocalLength: IFDRational(399, 100),
-        ExifTags.Base.FocalLengthIn35mmFilm: 28,
-        ExifTags.Base.ExposureTime: IFDRational(1, 120),
-        ExifTags.Base.ISOSpeedRatings: 40,
-    }
-    gps = {
-        ExifTags.GPS.GPSLatitudeRef: "S",
-        ExifTags.GPS.GPSLatitude: (IFDRational(33), IFDRational(30), IFDRational(36)),
-        ExifTags.GPS.GPSLongitudeRef: "E",
-        ExifTags.GPS.GPSLongitude: (IFDRational(151), IFDRational(15), IFDRational(0)),
-        ExifTags.GPS.GPSAltitudeRef: b"\x01",
-        ExifTags.GPS.GPSAltitude: IFDRational(25, 2),
-    }
-    entries = {ExifTags.Base.Make: "Maker\0", ExifTags.Base.Model: " Phone 7 ", ExifTags.Base.Orientation: 6}
-    exif = exif_with(entries, {ExifTags.IFD.Exif: camera, ExifTags.IFD.GPSInfo: gps})
+    tags, gps, ratio = ExifTags.Base, ExifTags.GPS, IFDRational
+    lens = {tags.LensModel: "Lens 4 mm f/1.8", tags.FocalLength: ratio(399, 100), tags.FocalLengthIn35mmFilm: 28}
+    camera = {**lens, tags.ExposureTime: ratio(1, 120), tags.ISOSpeedRatings: 40}
+    south = {gps.GPSLatitudeRef: "S", gps.GPSLatitude: (ratio(33), ratio(30), ratio(36))}
+    east = {gps.GPSLongitudeRef: "E", gps.GPSLongitude: (ratio(151), ratio(15), ratio(0))}
+    place = {**south, **east, gps.GPSAltitudeRef: b"\x01", gps.GPSAltitude: ratio(25, 2)}
+    entries = {tags.Make: "Maker\0", tags.Model: " Phone 7 ", tags.Orientation: 6}
+    exif = exif_with(entries, {ExifTags.IFD.Exif: camera, ExifTags.IFD.GPSInfo: place})
     Image.fromarray(noise(6, 8, 3)).save(path, exif=exif)
     found = read_exif(path)
     assert (found.make, found.model, found.lens) == ("Maker", "Phone 7", "Lens 4 mm f/1.8")
@@ -537,11 +528,8 @@ def test_exif_that_is_absent_or_odd_reads_as_none(tmp_path):
     wanted = ("make", "model", "lens", "focal_mm", "focal_35mm", "exposure_seconds", "iso", "gps")
     assert [getattr(nothing, name) for name in wanted] == [None] * len(wanted)
 
-    camera = {
-        ExifTags.Base.FocalLength: IFDRational(0, 0),
-        ExifTags.Base.ExposureTime: IFDRational(1, 0),
-        ExifTags.Base.FocalLengthIn35mmFilm: 0,
-    }
+    tags = ExifTags.Base
+    camera = {tags.FocalLength: IFDRational(0, 0), tags.ExposureTime: IFDRational(1, 0), tags.FocalLengthIn35mmFilm: 0}
     nothing_over_nothing, too_far = (IFDRational(0, 0),) * 3, (IFDRational(200),) * 3
     without_fix = (IFDRational(0),) * 3
     for place in ((nothing_over_nothing, too_far), (without_fix, without_fix)):

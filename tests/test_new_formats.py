@@ -240,10 +240,8 @@ class TestKapture:
     def test_a_rig_of_two_cameras(self, tmp_path):
         """The second camera is 0.2 to the right of the first, so the world moves left in it."""
         home = WITH_PHOTOS["kapture"](VIEWS, tmp_path).parent
-        text(
-            home / "rigs.txt",
-            "car, rig, 1, 0, 0, 0, 0, 0, 0\nrig, cam0, 2, 0, 0, 0, 0, 0, 0\nrig, cam1, 1,0,0,0,-0.2,0,0\n",
-        )
+        rigs = "car, rig, 1, 0, 0, 0, 0, 0, 0\nrig, cam0, 2, 0, 0, 0, 0, 0, 0\nrig, cam1, 1,0,0,0,-0.2,0,0\n"
+        text(home / "rigs.txt", rigs)
         replace_in(home / "trajectories.txt", " cam0,", " car,")
         text(home / "sensors.txt", (home / "sensors.txt").read_text() + "cam1,,camera,SIMPLE_PINHOLE,64,48,70,32,24\n")
         text(home / "records_camera.txt", "0000, cam0, walk/0.jpg\n0000, cam1, walk/1.jpg\n0007, cam1, walk/7.jpg\n")
@@ -292,10 +290,8 @@ class TestStrayScanner:
         for photo in (tmp_path / "rgb").iterdir():
             photo.unlink()
         capture = parse(tmp_path)
-        assert [(frame.name, frame.has_photo) for frame in capture.frames] == [
-            ("frame_000000", False),
-            ("frame_000001", False),
-        ]
+        found = [(frame.name, frame.has_photo) for frame in capture.frames]
+        assert found == [("frame_000000", False), ("frame_000001", False)]
         assert {frame.camera for frame in capture.frames} == {CAMERA}
         VIEWS.put(1, tmp_path / "rgb/000001.png")
         capture = parse(tmp_path)

@@ -165,9 +165,8 @@ def test_a_folder_of_undistorted_photos_is_not_taken_for_that_of_the_cameras(tmp
 def test_photos_of_another_shape_are_not_found(tmp_path):
     """Neither in another folder nor with another suffix; where it is only one, the others are used."""
     photos(tmp_path / "input", ["0.png"], size=(100, 100))
-    with pytest.raises(
-        UserError, match=r"input/0\.png has 100x100 pixels, which is not the shape of its camera, 640x480"
-    ):
+    what = r"input/0\.png has 100x100 pixels, which is not the shape of its camera, 640x480"
+    with pytest.raises(UserError, match=what):
         find(tmp_path, ["0.png"])
     photos(tmp_path / "images", ["0.png", "1.png"])
     photos(tmp_path / "images", ["2.png"], size=(100, 100))
@@ -645,9 +644,8 @@ def test_a_lens_of_a_later_colmap_is_named_with_what_supports_it(tmp_path):
     put("colmap", tmp_path)
     path = tmp_path / "sparse/0/cameras.bin"
     path.write_bytes(path.read_bytes()[:12] + struct.pack("<i", 31) + path.read_bytes()[16:])
-    with pytest.raises(
-        UserError, match=r"cameras\.bin: camera 1 has the camera model 31, which COLMAP .* lacks"
-    ) as caught:
+    what = r"cameras\.bin: camera 1 has the camera model 31, which COLMAP .* lacks"
+    with pytest.raises(UserError, match=what) as caught:
         parse(tmp_path)
     assert "EQUIRECTANGULAR" in caught.value.hint
 

@@ -462,9 +462,8 @@ def test_corners_of_a_blurred_square_are_where_its_edges_meet(seed, blur, turn):
 def test_markers_that_give_no_scale_are_reported(tmp_path):
     sheet = sheet_of_markers([3], 120)
     frames = photos_of(tmp_path, sheet, per_unit=120.0, count=2)
-    with pytest.raises(
-        UserError, match=r"no scale from the .* in 1 photo: 4 of 4 corners .* visible in only one photo"
-    ):
+    what = r"no scale from the .* in 1 photo: 4 of 4 corners .* visible in only one photo"
+    with pytest.raises(UserError, match=what):
         scale_from_markers(frames[:1], 0.05, dictionary="DICT_4X4_50")
     again = Frame("again.png", frames[0].camera, frames[0].world_from_cam, image=frames[0].image)
     with pytest.raises(UserError, match="visible only from nearly the same direction"):
@@ -508,12 +507,9 @@ def test_corners_through_distorted_lenses_and_how_well_their_error_is_estimated(
     ]
     square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]) - [0.5, 0.5, 0]
     angles = np.linspace(0, 5, 8)
-    frames = [
-        Frame(
-            f"{i}.png", lenses[i % 2], rigid.look_at(4 * np.array([np.cos(a), np.sin(a), 1.5]), np.zeros(3), np.ones(3))
-        )
-        for i, a in enumerate(angles)
-    ]
+    places = 4 * np.stack([np.cos(angles), np.sin(angles), np.full(8, 1.5)], axis=1)
+    poses = [rigid.look_at(place, np.zeros(3), np.ones(3)) for place in places]
+    frames = [Frame(f"{i}.png", lenses[i % 2], pose) for i, pose in enumerate(poses)]
     offsets = 1.2 * np.array([[0.0, 0, 0], [1, 0, 0.2], [-1, 0, 0.1]])
     sides = [Side(f"marker {m}", (m, k), (m, (k + 1) % 4), 0.1) for m in range(len(offsets)) for k in range(4)]
 

@@ -72,9 +72,8 @@ def test_splits_that_nerfstudio_lists_are_kept(tmp_path):
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
 def test_colmap_project_wherever_its_model_stands(tmp_path, model, place):
     shutil.copytree(model, tmp_path / place, dirs_exist_ok=True)
-    with pytest.raises(
-        UserError, match=r"colmap \(a COLMAP model\), none of its 10 photos is on disk, such as photo 00"
-    ):
+    what = r"colmap \(a COLMAP model\), none of its 10 photos is on disk, such as photo 00"
+    with pytest.raises(UserError, match=what):
         load_scene(tmp_path)
     put_photos(tmp_path / "images", *NAMES[1:])
     scene = load_scene(tmp_path)

@@ -248,15 +248,8 @@ def test_the_fields_of_interlaced_frames_are_taken_apart(tmp_path, stated):
     inner = np.s_[4:-4, 4:-4]
 
     def off(video: Video) -> float:
-        found = read_frames(video, [8, 12, 15])
-        return float(
-            np.mean(
-                [
-                    np.abs(f[inner] - views[2 * n][inner].astype(float)).mean()
-                    for f, n in zip(found, (8, 12, 15), strict=True)
-                ]
-            )
-        )
+        found, expected = read_frames(video, [8, 12, 15]), [views[2 * number] for number in (8, 12, 15)]
+        return np.mean([np.abs(a[inner] - b[inner].astype(float)) for a, b in zip(found, expected, strict=True)]).item()
 
     assert off(replace(video, fields=measured.fields)) < 0.5 * off(replace(video, fields=""))
 
