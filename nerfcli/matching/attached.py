@@ -18,6 +18,7 @@ from scipy.ndimage import distance_transform_edt
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import apply, inverse
+from nerfcli.photos.images import reduced
 from nerfcli.photos.loading import LoadedPhoto
 
 # Size at which photos are compared, and the smoothing of the pictures before their gradients are computed, pixels.
@@ -67,8 +68,8 @@ def attached_masks(photos: Sequence[LoadedPhoto], *, threads: int) -> Mapping[Le
         for lens, group in groups.items():
             chosen = [group[index] for index in examined(len(group))]
             if chosen:
-                small = np.stack(list(pool.map(lambda photo: reduced(photo.pixels), chosen)))
-                mask = fixed_mask(small, partial(_least_motions, [photo.frame for photo in chosen]))
+                pictures = np.stack(list(pool.map(lambda photo: small(photo.pixels), chosen)))
+                mask = fixed_mask(pictures, partial(_least_motions, [photo.frame for photo in chosen]))
                 if mask is not None:
                     masks[lens] = enlarged(mask, lens[1])
     return masks
@@ -100,12 +101,9 @@ def examined(count: int) -> list[int]:
     return np.linspace(0, count - 1, min(count, MOST_PHOTOS)).round().astype(int).tolist()
 
 
-def reduced(pixels: np.ndarray) -> np.ndarray:
+def small(pixels: np.ndarray) -> np.ndarray:
     """Return a picture (H, W, 3) uint8 at the size at which photos are compared, (h, w, 3) float32."""
-    height, width = pixels.shape[:2]
-    scale = min(1.0, LONGER_SIDE_PX / max(width, height))
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    return reduced(pixels, LONGER_SIDE_PX).astype(np.float32)
 
 
 def enlarged(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:

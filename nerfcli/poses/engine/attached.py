@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from nerfcli.errors import several
-from nerfcli.matching.attached import Lens, enlarged, examined, fixed_mask, lens_of, reduced
+from nerfcli.matching.attached import Lens, enlarged, examined, fixed_mask, lens_of, small
 from nerfcli.photos.images import image_size, read_image
 from nerfcli.poses.input.job import Job, Tell, WorkMask
 from nerfcli.poses.input.layout import write_mask, write_no_mask
@@ -39,8 +39,8 @@ def mask_attached(
     with ThreadPoolExecutor(job.threads) as pool:
         for lens, group in groups.items():
             files = [job.photos / job.files[group[index]] for index in examined(len(group))]
-            small = list(pool.map(lambda file: reduced(read_image(file)[..., :3]), files))
-            mask = fixed_mask(np.stack(small)) if small else None
+            pictures = list(pool.map(lambda file: small(read_image(file)[..., :3]), files))
+            mask = fixed_mask(np.stack(pictures)) if pictures else None
             if mask is None:
                 continue
             places = np.concatenate([np.zeros((0, 2)), *(found for number, found in moving if lenses[number] == lens)])
