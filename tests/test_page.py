@@ -47,7 +47,7 @@ from nerfcli.workflows.export import export_run
 
 # The change of a colour in [0, 1] by 16-bit rows, single precision and the colours that neither side evaluates.
 COLOUR_BOUND = 2e-3
-# `nerfcli render` leaves out cells with less than this of a ray's light, see `training.fine_cells`; a page does not.
+# `nerfcli render` leaves out cells with less than this of a ray's light, see `training.picture_cells`; a page does not.
 FINE_BOUND = 2e-3
 # Longer side of the maps of photos' depths: a quarter of the usual rays.
 PHOTO_SIZE = 48

@@ -21,8 +21,8 @@ from nerfcli.captures.loading import load_scene
 from nerfcli.evaluate.ledger import leak_ledger
 from nerfcli.poses.engine import worker
 from nerfcli.poses.engine.database import register_photos
+from nerfcli.poses.engine.held_out_photos import move_held_out_last, place_held_out, training_part
 from nerfcli.poses.engine.mapping import MappedModels
-from nerfcli.poses.engine.strict import move_held_out_last, place_held_out, training_part
 from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.model.reasons import NO_MODEL, dominant

@@ -1,1 +1,1 @@
-"""Camera geometry in NumPy float64: rigid transforms, lens models, capture formats and camera paths; no torch."""
+"""Camera geometry in NumPy float64: rigid transforms, lens models and camera paths; no torch."""

@@ -13,6 +13,7 @@ from nerfcli.ply import description_in, read_ply_header
 GLB_JSON = 0x4E4F534A
 # Note for files without a description.
 NOT_STATED = "unit and frame"
+# Meshes that are written, the default first, and read.
 SUFFIXES = (".ply", ".glb", ".obj")
 
 

@@ -17,7 +17,7 @@ from nerfcli.captures.formats import scene_folder
 from nerfcli.captures.formats.registry import depths_beside
 from nerfcli.captures.holdout import names_held_out
 from nerfcli.errors import UserError, several
-from nerfcli.poses.engine.strict import move_held_out_last
+from nerfcli.poses.engine.held_out_photos import move_held_out_last
 from nerfcli.poses.engine.supervise import WorkerDiedError, run_worker
 from nerfcli.poses.engine.turntable import MASKS, add_advice
 from nerfcli.poses.input.job import Job, Report, Tell, write_job

@@ -64,7 +64,7 @@ class TrainedField:
     Args:
         field: the radiance field, on points of the training frame.
         occupied: (G, G, G) bool over the field's unit cube.
-        fine: the same over a finer grid, see `training.fine_cells`; None for models without.
+        fine: the same over a finer grid, see `training.picture_cells`; None for models without.
         background: sRGB behind everything, for pictures without alpha.
         training_from_scene: normalisation of the scene to the training frame.
         unit: unit of length of the scene's frame, "arbitrary" or "metre".

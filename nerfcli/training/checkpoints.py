@@ -32,8 +32,8 @@ from nerfcli.render.model import Model, save_model
 from nerfcli.render.tracing import render_rays
 from nerfcli.training.appearance import over_background
 from nerfcli.training.extent import Extent
-from nerfcli.training.fine_cells import FEWEST_STEPS, with_fine_cells
 from nerfcli.training.fitting import Fitting, TrainingInputs
+from nerfcli.training.picture_cells import FEWEST_STEPS, with_picture_cells
 from nerfcli.training.pool import PixelPool, load_album
 from nerfcli.training.preparation import EarlierDecisions
 from nerfcli.training.runs.files import FIELD, STATE, add_to_log
@@ -143,7 +143,7 @@ class Checkpoints:
         if distributed.rank() == 0:
             model = self.model()
             has_surfaces = isinstance(model.field, HashField) and self._fitting.step >= FEWEST_STEPS
-            self._write(with_fine_cells(model, self.frames()[0]) if has_surfaces else model)
+            self._write(with_picture_cells(model, self.frames()[0]) if has_surfaces else model)
 
     def _write(self, model: Model) -> None:
         tensors, description = self._fitting.state()

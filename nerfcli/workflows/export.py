@@ -11,6 +11,7 @@ from nerfcli.errors import UserError
 from nerfcli.export.depth_views import DepthView, depth_views, surface_colours
 from nerfcli.export.extent import MOST_VIEWS, Grid, SurfaceSettings, automatic_voxel, scene_box
 from nerfcli.export.fusion import agreed_points, fuse
+from nerfcli.export.mesh_facts import SUFFIXES as MESH_SUFFIXES
 from nerfcli.export.meshes import simplified, surface_of, without_small_pieces, write_glb, write_obj
 from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
@@ -32,7 +33,7 @@ PAGE_BYTES = 9_700_000
 # File suffixes by type of export, the default first.
 TARGETS = {
     "page": (".html",),
-    "mesh": (".ply", ".glb", ".obj"),
+    "mesh": MESH_SUFFIXES,
     "points": (".ply",),
     "splats": (".ply", ".spz", ".html"),
 }
@@ -149,7 +150,7 @@ def _export_mesh(run: Run, model: Model, path: Path, *, settings: SurfaceSetting
             write_glb(path, mesh, colours=colours, y_up_from_frame=y_up_from_scene(run), description=described)
         case ".obj":
             write_obj(path, mesh, colours=colours, description=described)
-        case _:
+        case ".ply":
             photos, parallax = coverage_and_parallax([view.distances() for view in views], mesh.vertices)
             columns = _columns(mesh.vertices, mesh.normals.astype("<f4"), colours)
             columns |= {"photos": photos.astype(np.uint16), "parallax_deg": parallax}

@@ -28,10 +28,10 @@ from nerfcli.child import take_stdout
 from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.database import discard_if_damaged, evidence, feature_counts, name_images, register_photos
 from nerfcli.poses.engine.features import extract, match, start_matching
+from nerfcli.poses.engine.held_out_photos import place_held_out, training_part
 from nerfcli.poses.engine.mapping import MappedModels, file_keys, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.engine.remap import ChosenModel, choose_model
 from nerfcli.poses.engine.retrieval import select_pairs
-from nerfcli.poses.engine.strict import place_held_out, training_part
 from nerfcli.poses.engine.turntable import describe_motions, mask_turning_object, recall_masks
 from nerfcli.poses.input.job import Job, Report, Tell, read_job, read_stage, stage_key, write_stage
 from nerfcli.poses.judge.checks import checks_of

@@ -15,7 +15,7 @@ from nerfcli.render.model import Model, load_model, save_model
 from nerfcli.render.pictures import render_picture
 from nerfcli.render.tracing import PictureRays, pixel_rays, render_rays
 from nerfcli.render.trained_field import Marching
-from nerfcli.training import fine_cells
+from nerfcli.training import picture_cells
 
 BLACK = (0.0, 0.0, 0.0)
 # Cells along an edge of the cube. All 256 of a training take a minute; `spheres_run` has those.
@@ -68,8 +68,8 @@ def models() -> tuple[Model, Model, list[Frame]]:
     """The ball without and with fine cells, found by views from one half of the circle, and new views from there."""
     frames = [looking_at_it(angle, 60) for angle in np.linspace(0, np.pi, 7)]
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(fine_cells, "SIDE", SIDE)
-        fine = fine_cells.with_fine_cells(ball(), frames)
+        patched.setattr(picture_cells, "SIDE", SIDE)
+        fine = picture_cells.with_picture_cells(ball(), frames)
     return ball(), fine, [looking_at_it(angle, 60) for angle in (0.3, 1.5, 2.9)]
 
 

@@ -29,7 +29,7 @@ EMPTY = 3e-4
 
 
 @torch.no_grad()
-def with_fine_cells(model: Model, frames: Sequence[Frame]) -> Model:
+def with_picture_cells(model: Model, frames: Sequence[Frame]) -> Model:
     """Return the model with the open cells of a fine grid: those that hold something, or that no ray of a photo meets.
 
     Args:
