@@ -8,7 +8,7 @@ from skimage.filters import threshold_otsu
 
 from nerfcli.ct.centre import FEWEST_VIEWS, FINE, SIGNIFICANT, Centre, centre_of, margin
 from nerfcli.ct.formats.assemble import axis_column
-from nerfcli.ct.marks import WEDGE_DEG, missing_wedge_deg
+from nerfcli.ct.marks import WEDGE_DEG, gaps_deg
 from nerfcli.ct.open_beam import MEDIAN_DEVIATION
 from nerfcli.ct.quick import Row, grid_of_row, highest_contrast_row, predicted, reconstructed
 from nerfcli.ct.scan import Scan
@@ -234,13 +234,16 @@ def truncation(sample: Sample) -> Finding:
 
 def missing_wedge(sample: Sample) -> Finding:
     """Find the directions that no ray covers."""
-    missing = missing_wedge_deg(sample.scan.geometry.select(sample.scan.live_views))
+    largest, usual = gaps_deg(sample.scan.geometry.select(sample.scan.live_views))
+    missing = largest - usual
     return finding(
         "missing wedge",
         verdict_above(missing, look=WEDGE_DEG, bad=WEDGE_BAD_DEG),
-        f"a wedge of {missing:.4g} degrees is missing" if missing else "the directions of rays go all around",
+        f"a wedge of {missing:.4g} degrees is missing"
+        if missing > WEDGE_DEG
+        else "the directions of rays go all around",
         missing,
-        f"look from {WEDGE_DEG:g} degrees, bad from {WEDGE_BAD_DEG:g}",
+        f"look from {WEDGE_DEG:g} degrees beyond the usual step, bad from {WEDGE_BAD_DEG:g}",
         advice="edges along the missing directions cannot be reconstructed; the volume is marked there",
     )
 

@@ -84,15 +84,19 @@ def _bit(place: np.ndarray) -> np.ndarray:
 
 
 def missing_wedge_deg(geometry: ScanGeometry) -> float:
-    """Return the largest gap in degrees between rays through the origin, as undirected lines around z.
+    """Return the largest gap in degrees of `gaps_deg`; 0 if it is below the thresholds of a wedge."""
+    largest, usual = gaps_deg(geometry)
+    return largest if largest > WEDGE_STEPS * usual and largest > WEDGE_DEG else 0.0
 
-    0 if the gap is below the thresholds of a wedge: then the views go all around. Only the origin is considered; at the
-    object's border, the fan of rays fills some of the gaps.
+
+def gaps_deg(geometry: ScanGeometry) -> tuple[float, float]:
+    """Return the largest and the usual gap in degrees between rays through the origin, as undirected lines around z.
+
+    Only the origin is considered; at the object's border, the fan of rays fills some of the gaps.
     """
     direction = geometry.emitter if geometry.beam == "parallel" else -geometry.emitter
     angle = np.sort(np.rad2deg(np.arctan2(direction[:, 1], direction[:, 0])) % 180)
     if len(angle) < 2:
-        return 180.0
+        return 180.0, 0.0
     gaps = np.diff(np.append(angle, angle[0] + 180))
-    largest, usual = float(gaps.max()), float(np.median(gaps[gaps > 1e-6])) if (gaps > 1e-6).any() else 180.0
-    return largest if largest > WEDGE_STEPS * usual and largest > WEDGE_DEG else 0.0
+    return float(gaps.max()), float(np.median(gaps[gaps > 1e-6])) if (gaps > 1e-6).any() else 180.0

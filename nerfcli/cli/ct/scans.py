@@ -33,7 +33,7 @@ class ScanStatements:
     ] = None
     unit: Annotated[
         str | None,
-        typer.Option(help="Unit of lengths in IN, m, mm, um or nm; overrides what IN states."),
+        typer.Option(help="Unit of lengths in IN, m, cm, mm, um or nm; overrides what IN states."),
     ] = None
     mirrored: Annotated[
         bool, typer.Option("--mirrored", help="Columns are numbered from the other side than IN says.")

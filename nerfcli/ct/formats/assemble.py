@@ -87,7 +87,7 @@ def scan_of(found: ReaderOutput, given: ScanOptions) -> Scan:
     if unit == "mm" and not PIXEL_MM[0] <= pixel <= PIXEL_MM[1]:
         raise UserError(
             f"{found.path}: a pixel of {pixel:g} mm",
-            f"between {PIXEL_MM[0]:g} and {PIXEL_MM[1]:g} mm are possible; set the unit of lengths with --unit",
+            f"between {PIXEL_MM[0]:g} and {PIXEL_MM[1]:g} mm are possible; set the unit with nerfcli ct convert --unit",
         )
     if given.centre_column is not None:
         geometry = _with_centre(geometry, given.centre_column)

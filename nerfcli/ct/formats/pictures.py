@@ -59,7 +59,7 @@ def stated_projections(
     if not paths or len(paths) not in counts:
         raise UserError(
             f"{folder} holds {len(paths)} projections; {file.name} states {counts[0]}",
-            f"expected pictures named {stem}0001.tif and so on, all of them",
+            f"expected all of the numbered pictures, whose names begin with {stem}",
         )
     return paths
 
