@@ -39,8 +39,7 @@ from nerfcli.errors import (
     in_shell,
 )
 from nerfcli.interrupts import install_handlers
-from nerfcli.photos.images import read_image
-from nerfcli.photos.masks import write_masks
+from nerfcli.photos.images import read_image, write_png
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.render.depth import DepthRequest
@@ -49,7 +48,7 @@ from nerfcli.render.files.float_maps import read_tiff
 from nerfcli.training import loop
 from nerfcli.training.loop import Progress
 from nerfcli.training.runs import settings
-from nerfcli.training.runs.files import append_log, read_log
+from nerfcli.training.runs.files import append_log, left_out_mask, read_log
 from nerfcli.training.runs.run import load_run
 from nerfcli.workflows import pipeline
 from nerfcli.workflows.splats import file_digest
@@ -558,7 +557,7 @@ def test_masks_of_an_earlier_training_are_removed_unless_the_scene_has_them(capt
     run, masked = capture.with_name("spheres-run"), tmp_path / "masked"
     assert nerfcli("train", capture, *QUICK).exit_code == 0
     first = load_scene(capture).train_frames[0]
-    write_masks(run / "occluders", {first.name: np.zeros((first.camera.height, first.camera.width), bool)})
+    write_png(left_out_mask(run, first.name), np.zeros((first.camera.height, first.camera.width), np.uint8))
     completed("convert", capture, masked, "--to", "nerfcli", "--masks", run / "occluders")
     for option in ("--overwrite", "--resume"):
         assert "holds masks that this scene uses, such as" in refusal("train", masked, *QUICK, "-o", run, option)[0]

@@ -22,16 +22,15 @@ from nerfcli.captures.formats.run_cameras import write_cameras
 from nerfcli.errors import UserError, duration
 from nerfcli.field.exposure import exposed
 from nerfcli.kernels.numba_cpu.splats import render_splats
-from nerfcli.photos.images import read_image
+from nerfcli.photos.images import read_image, write_png
 from nerfcli.photos.loading import LoadedPhoto
-from nerfcli.photos.masks import write_masks
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.job import RenderSettings
 from nerfcli.splats import refine as refinement
 from nerfcli.splats.gaussians import Gaussians, gaussians_of, rows_of
 from nerfcli.splats.refine import Refinement, load_splat_state, refine, splat_photos
 from nerfcli.splats.render import SplatScene
-from nerfcli.training.runs.files import OCCLUDERS, SPLATS
+from nerfcli.training.runs.files import SPLATS, left_out_mask
 from nerfcli.workflows.evaluate import evaluate_splats
 from nerfcli.workflows.render import render_splats as render_file
 from nerfcli.workflows.splats import SplatSettings
@@ -238,7 +237,7 @@ def test_pixels_that_the_training_left_out_have_no_say(
     first, second, *others = cameras.train
     width, height = first.camera.size
     mask = np.tile(np.arange(width) >= width // 2, (height, 1))
-    write_masks(run / OCCLUDERS, {first.name: mask})
+    write_png(left_out_mask(run, first.name), np.where(mask, 255, 0).astype(np.uint8))
     # The distortion of this lens turns back within the picture.
     lens = Camera("SIMPLE_RADIAL", width, height, (first.camera.focal_px, width / 2, height / 2, -3.0))
     has_ray = lens.pixel_bearings()[1].reshape(height, width)

@@ -20,7 +20,7 @@ from nerfcli.captures.formats.scene_folder import SCENE_FILE
 from nerfcli.captures.holdout import HELD_OUT_EVERY, default_split, names_held_out
 from nerfcli.captures.orientation import UPRIGHT, rescaled_sizes, upright
 from nerfcli.errors import UserError, in_shell, several
-from nerfcli.photos.images import list_photos
+from nerfcli.photos.images import list_images
 from nerfcli.photos.masks import masks_inside
 
 
@@ -184,6 +184,6 @@ def _without_pose(scene: Capture) -> tuple[Path, list[Path]]:
     """Return the folder of a scene's photos, with those of the photos in it that the scene does not have."""
     images = [frame.image for frame in scene.frames if frame.image is not None]
     folder = Path(os.path.commonpath([image.parent for image in images]))
-    there = list_photos(folder, subfolders=any(image.parent != folder for image in images)).pictures
+    there = [file for parent in sorted({image.parent for image in images}) for file in list_images(parent)]
     masks = {name for image in images for name in (image.name, f"{image.stem}_mask")}
     return folder, [file for file in there if file not in {*images} and file.stem not in masks]

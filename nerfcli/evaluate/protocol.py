@@ -333,7 +333,6 @@ def _protocol_name(held_out: Sequence[HeldOutPhoto], lpips: str) -> str:
     sources = {photo.gains_from for photo in held_out} - {"none"}
     exposures = f", exposures by {' or '.join(sorted(sources))}" if sources else ""
     alpha = ", RGBA on white" if any(photo.pixels.shape[-1] == 4 for photo in held_out) else ""
-
     return (
         f"{PROTOCOL}: {len(held_out)} held-out photos (names sha256 {names}) at {' '.join(sizes)}, area-averaged, "
         f"sRGB 8 bit{alpha}{exposures}, mean of per-image values; PSNR; SSIM with Gaussian window 1.5, 11 x 11, of "

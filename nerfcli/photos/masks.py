@@ -5,14 +5,14 @@ the file: tools that ignore the EXIF orientation write the latter, and the mask 
 """
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from nerfcli.errors import UserError
 from nerfcli.photos.exif import read_exif
-from nerfcli.photos.images import HEIC_SUFFIXES, IMAGE_SUFFIXES, read_image, upright, write_png
+from nerfcli.photos.images import HEIC_SUFFIXES, IMAGE_SUFFIXES, read_image, upright
 
 # Formats whose compression leaves artefacts around an edge, in both the black and the white areas.
 _LOSSY_SUFFIXES = frozenset({".jpg", ".jpeg", ".webp"}) | HEIC_SUFFIXES
@@ -77,9 +77,3 @@ def read_mask(path: Path, photo: Path) -> np.ndarray:
     if path.suffix.lower() in _LOSSY_SUFFIXES:
         return np.where(levels >= _MIDDLE, np.uint8(255), np.uint8(0))
     return levels * np.uint8(255) if levels.max() == 1 else levels
-
-
-def write_masks(folder: Path, masks: Mapping[str, np.ndarray]) -> None:
-    """Write FOLDER/PHOTO.png for masks (height, width) bool by the name of the photo: white is used, black ignored."""
-    for name, mask in masks.items():
-        write_png(folder / f"{name}.png", np.where(mask, 255, 0).astype(np.uint8))

@@ -42,8 +42,8 @@ class PosesReport:
     left about the last one, if any. matching: the rule for pairs, their number, and hashes of the photos, masks and
     files that were used. search: the search that the features are from, see `settings.Search`. points: number of points
     of the kept model. intrinsics: the given intrinsics, see `cameras.PhotoGroups`. strict: how held-out photos were
-    placed afterwards, see `strict.place_held_out`. components: each model's photos and why it is not joined to the
-    largest, ordered by size.
+    placed afterwards, see `held_out_photos.place_held_out`. components: each model's photos and why it is not joined to
+    the largest, ordered by size.
     not_computed: checks that could not be computed, and why.
     cut_short: what was stopped because it took far longer than planned.
     moving_foreground: facts about an object that turns in front of a static background, and its masks; see `turntable`.

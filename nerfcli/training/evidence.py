@@ -182,7 +182,9 @@ def collect_evidence(
     has_points = found.track_depths is not None and len(found.track_depths.numbers) > 0
     stereo_is_open = points_are_open and has_points and (wanted.stereo if "stereo" in fixed else bool(side_px))
     with_exposures = wanted.exposure == "matched" or (wanted.exposure == "learned" and wanted.stereo) or stereo_is_open
-    with_occluders = wanted.occluders or (stereo_is_open and "occluders" not in fixed)
+    # Occluders that a selection has found come with stereo; without it, it has found something attached to the camera.
+    wants_occluders = wanted.occluders and (settings.model != "auto" or "occluders" in fixed or wanted.stereo)
+    with_occluders = wants_occluders or (stereo_is_open and "occluders" not in fixed)
     with_depths = stereo_is_open or (wanted.stereo and found.track_depths is not None)
     dense: Sequence[DenseDepth] = ()
     if with_exposures or with_occluders or with_depths:

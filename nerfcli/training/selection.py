@@ -120,8 +120,9 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
     """Return the model with components that photos support before any training, unless set, and the decisions.
 
     These are points, at which rays should end, depths from stereo matching and from a sensor, the omission of what
-    hides surfaces that other photos see, exposures from shared pixels, and a sky that 3D points confirm. They are in
-    the model from the first step on: later, density has formed elsewhere already. A sensor's depths need no good poses.
+    hides surfaces that other photos see or is attached to the camera, exposures from shared pixels, and a sky that 3D
+    points or stereo confirm. They are in the model from the first step on: later, density has formed elsewhere already.
+    A sensor's depths need no good poses.
     """
     wanted: list[tuple[Change, str]] = []
     may_use = may_use_points(requested, facts.fixed, has_alpha=facts.has_alpha, cameras=facts.cameras)

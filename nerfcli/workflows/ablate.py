@@ -113,11 +113,11 @@ def ablate_scene(
 
 def _capture(scene: Capture) -> CaptureTraits:
     """Return the traits of a scene that decide which components can be varied."""
-    first, sparse = scene.train_frames[0].image, find_model(scene.root)
+    images, sparse = [frame.image for frame in scene.train_frames if frame.image is not None], find_model(scene.root)
     seen = parse_colmap(sparse).observations if sparse is not None else None
     exif = log_exposures(scene.train_frames)
     return CaptureTraits(
-        has_alpha=first is not None and is_transparent(read_image(first)),
+        has_alpha=any(is_transparent(read_image(image)) for image in images),
         has_points=seen is not None and len(seen.pixels) > 0,
         has_exif=bool(np.ptp(relative_log_exposures(exif, mean_log_exposure(exif))) > 0.0),
     )

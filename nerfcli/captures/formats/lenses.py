@@ -130,7 +130,8 @@ def parts_of_matrix(matrix: np.ndarray, size: Size, where: str) -> tuple[Pair, P
         UserError: the matrix is not of this form; `where` is named.
     """
     (fx, skew, cx), (lower, fy, cy), last = matrix.tolist()
-    if not np.isfinite(matrix).all() or lower != 0 or last != [0, 0, 1]:
+    is_lower = abs(lower) * size[0] > _NEGLIGIBLE_SKEW_PX * abs(fx)  # more than rounding
+    if not np.isfinite(matrix).all() or is_lower or last != [0, 0, 1]:
         raise malformed(where, "is not a matrix of intrinsics", "expected the rows fx 0 cx, 0 fy cy, 0 0 1")
     matters = abs(skew) * size[1] > _NEGLIGIBLE_SKEW_PX * abs(fy)
     return (fx, fy), (cx, cy), skew if matters else 0.0

@@ -114,7 +114,8 @@ def recall_masks(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
         return None
     if content.get("attached"):
         masked = recalled(job, content["attached"])
-        return None if masked is None else (masked, content if "found" in content else None)
+        facts = {key: value for key, value in content.items() if key != "attached"}
+        return None if masked is None else (masked, facts or None)
     if not content or not content["masked"]:
         return job, content or None
     unmasked = [name for name in content["unmasked"] if not (scene_masks(job) / f"{name}.png").is_file()]
@@ -175,6 +176,7 @@ def mask_turning_object(job: Job, tell: Tell) -> tuple[Job, dict[str, Any] | Non
     if facts["masked"]:
         job = replace(job, masks=_write_masks(job, masks, edited))
     write_stage(Path(job.folder) / _STAGE, _key(job), facts)
+    facts.pop("attached", None)
     return job, facts
 
 

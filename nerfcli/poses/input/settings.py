@@ -40,9 +40,9 @@ class PoseSettings:
     `CAMERA_MODELS`. min_registered: the fraction of photos that must be placed, 0...1. pairing: one of `PAIRINGS`; with
     pairs_file, a text file with two names per line, only these pairs are matched. masks: a folder of masks, see
     `photos.masks`. holdout: the rule by which photos are held out, see `captures.holdout`. strict: whether held-out
-    photos are placed afterwards, with the result of the other photos fixed, see `strict`. accept_refused: whether a
-    model that the checks refuse becomes the scene anyway. subfolders: whether photos in subfolders are used, those of
-    each as of a camera of their own.
+    photos are placed afterwards, with the result of the other photos fixed, see `held_out_photos`. accept_refused:
+    whether a model that the checks refuse becomes the scene anyway. subfolders: whether photos in subfolders are used,
+    those of each as of a camera of their own.
     """
 
     max_image_size: int = QUALITIES["default"][0]
