@@ -59,7 +59,7 @@ def write_left_out(run: Path, inputs: TrainingInputs, *, notify: Callable[[str],
             f"occluders: {np.mean(list(left_out.values())):.1f} % of the pixels left out, in {len(most)} of "
             f"{len(hidden)} photos, most in {named}; masks in {folder}"
         )
-    elif hidden:
+    elif hidden and not inputs.attached:
         notify("occluders: none found")
 
 
