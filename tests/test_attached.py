@@ -162,14 +162,14 @@ def test_training_and_evaluation_leave_it_out(capture, tmp_path, fixed):
     notes: list[str] = []
     train(capture, tmp_path / "run", chosen, resume=False, notify=notes.append, on_progress=lambda progress: None)
     written = {path.name for path in (tmp_path / "run" / "occluders").rglob("*.png")}
-    told = [note for note in notes if note.startswith("attached to the camera: ") and "of 9 photos" in note]
+    messages = [note for note in notes if note.startswith("attached to the camera: ") and "of 9 photos" in note]
     run = Run(tmp_path / "run")
     (held_out,) = held_out_photos(run, run.cameras.test)
     if fixed:
-        assert (written, told, held_out.used) == (set(), [], None)
+        assert (written, messages, held_out.used) == (set(), [], None)
         return
     assert written == {f"{number}.png.png" for number in range(9)}
-    assert len(told) == 1
+    assert len(messages) == 1
     assert held_out.used is not None
     assert not held_out.used[GRIPPER].any()
     assert held_out.used[~grown(GRIPPER, 8)].all()

@@ -174,7 +174,7 @@ def wrongly_mapped(solved: Solved, folder: Path) -> MappedModels:
 
 
 def remapped(wrong: MappedModels, refused: ExaminedModel) -> tuple[ChosenModel, list[str]]:
-    """Return what is accepted instead of a refused model, and what is told."""
+    """Return what is accepted instead of a refused model, and the messages for the user."""
     notes: list[str] = []
     chosen = remap_refused(ChosenModel(wrong, refused), lambda *progress: None, notes.append)
     assert chosen.examined.verdict.accepted

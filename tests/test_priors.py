@@ -217,9 +217,9 @@ def test_cameras_with_an_impossible_lens_are_named_and_not_called_exact(spheres,
     bent = Camera("RADIAL", width, height, (focal.focal_px, width / 2, height / 2, -20.0, 0.0))
     broken = replace(spheres, frames=tuple(replace(frame, camera=bent) for frame in spheres.frames))
     assert "these cameras are exact" in notes(spheres)
-    told = notes(broken)
-    assert "these cameras are exact" not in told
-    assert re.search(r"[6-9]\d % of all: the distortion of the lens must be wrong", told)
+    said = notes(broken)
+    assert "these cameras are exact" not in said
+    assert re.search(r"[6-9]\d % of all: the distortion of the lens must be wrong", said)
 
 
 def test_trials_that_become_non_finite_end_without_an_error(capture, tmp_path, monkeypatch):

@@ -62,7 +62,7 @@ def render(
 ) -> list[float]:  # fmt: skip
     """Render, and return how many of the frames were done after each tile, which is a whole frame here.
 
-    `on_frames` is told the same while it renders.
+    `on_frames` receives the same while it renders.
     """
     counts: list[float] = []
 

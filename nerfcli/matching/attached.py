@@ -37,8 +37,8 @@ DISTANCES, EXAMINED, FOLLOWED = np.geomspace(0.2, 300.0, 48), 6, 6
 # Edges and gaps up to this size are one part. A part has at least this fraction of the picture, and begins within the
 # last fraction of the longer side from the picture's border: mounts and watermarks are there.
 GAP_PX, LEAST_PART, BORDER = 7, 0.002, 0.1
-# Pixels whose levels differ between photos as little as those of the edges, and by this fraction of what is usual in
-# the picture, belong to a part up to the second fraction of the longer side away.
+# Pixels whose levels differ between photos as little as those of a part, and by this fraction of what is usual in the
+# picture, belong to the part up to the second fraction of the longer side away.
 MOST_SPREAD, REACH = 0.2, 0.08
 # What a part separates from the rest of the picture belongs to it up to this fraction of the picture.
 MOST_ENCLOSED = 0.25
@@ -47,6 +47,7 @@ MOST_ENCLOSED = 0.25
 MOST_OF_PICTURE = 0.6
 
 Lens = tuple[PurePosixPath, tuple[int, int]]
+MotionsAcross = Callable[[np.ndarray, np.ndarray, tuple[int, int]], np.ndarray]
 
 
 def lens_of(name: str, size: tuple[int, int]) -> Lens:
@@ -111,9 +112,7 @@ def enlarged(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
 
 
-def fixed_mask(
-    levels: np.ndarray, motions: Callable[[np.ndarray, np.ndarray, tuple[int, int]], np.ndarray] | None = None
-) -> np.ndarray | None:
+def fixed_mask(levels: np.ndarray, motions: MotionsAcross | None = None) -> np.ndarray | None:
     """Return the mask (h, w) of what has the same place in all pictures of a camera, near the border; None for nothing.
 
     Args:
@@ -121,28 +120,38 @@ def fixed_mask(
         motions: how far the scene moves across edges, (N,) pixels, from their places (N, 2), normals (N, 2) and the
             (height, width) of the pictures; without it, an edge may be one of the scene that moves only along itself.
     """
+    mask = _parts_at_border(_still_edges(levels, motions))
+    if not mask.any():
+        return None
+    mask = _with_enclosed(_with_surroundings(mask, levels))
+    mask = cv2.dilate(mask.astype(np.uint8), _square(5)) > 0
+    return mask if mask.mean() <= MOST_OF_PICTURE else None
+
+
+def _still_edges(levels: np.ndarray, motions: MotionsAcross | None) -> np.ndarray:
+    """Return the edges (h, w) whose directions agree in all pictures, and which the scene cannot have there."""
     directions = np.mean([_directions(one) for one in levels], axis=0)
     agreement = np.linalg.norm(directions, axis=-1)
     edges = agreement > LEAST_AGREEMENT
-    if motions is not None and edges.any():
-        rows, columns = (places[:: 1 + edges.sum() // MOST_PIXELS] for places in np.nonzero(edges))
-        normals = directions[rows, columns] / agreement[rows, columns, None]
-        moves = np.full(edges.shape, np.nan)
-        moves[rows, columns] = motions(np.stack([columns, rows], axis=-1) + 0.5, normals, edges.shape)
-        nearest = distance_transform_edt(np.isnan(moves), return_distances=False, return_indices=True)
-        edges &= moves[tuple(np.asarray(nearest))] > LEAST_MOTION_PX
-    mask = _parts_at_border(edges)
-    if not mask.any():
-        return None
+    if motions is None or not edges.any():
+        return edges
+    rows, columns = (places[:: 1 + edges.sum() // MOST_PIXELS] for places in np.nonzero(edges))
+    normals = directions[rows, columns] / agreement[rows, columns, None]
+    moves = np.full(edges.shape, np.nan)
+    moves[rows, columns] = motions(np.stack([columns, rows], axis=-1) + 0.5, normals, edges.shape)
+    nearest = distance_transform_edt(np.isnan(moves), return_distances=False, return_indices=True)
+    return edges & (moves[tuple(np.asarray(nearest))] > LEAST_MOTION_PX)
+
+
+def _with_surroundings(parts: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """Return parts (h, w) with the pixels around them that are as constant as they are, without gaps."""
     spread = np.median(np.abs(levels - np.median(levels, axis=0)), axis=0).max(-1)
-    away = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    constant = spread <= min(np.median(spread[mask & edges]), MOST_SPREAD * np.median(spread))
-    near = mask | (constant & (away <= REACH * max(mask.shape)))
+    away = cv2.distanceTransform((~parts).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    constant = spread <= min(np.median(spread[parts]), MOST_SPREAD * np.median(spread))
+    near = parts | (constant & (away <= REACH * max(parts.shape)))
     _, labels = cv2.connectedComponents(near.astype(np.uint8), connectivity=4)
-    near = np.isin(labels, np.unique(labels[mask]))
-    mask = _with_enclosed(cv2.morphologyEx(near.astype(np.uint8), cv2.MORPH_CLOSE, _square(GAP_PX)) > 0)
-    mask = cv2.dilate(mask.astype(np.uint8), _square(5)) > 0
-    return mask if mask.mean() <= MOST_OF_PICTURE else None
+    joined = np.isin(labels, np.unique(labels[parts]))
+    return cv2.morphologyEx(joined.astype(np.uint8), cv2.MORPH_CLOSE, _square(GAP_PX)) > 0
 
 
 def _directions(levels: np.ndarray) -> np.ndarray:
