@@ -153,11 +153,21 @@ class TestRealityScanXmp:
         WITH_PHOTOS["realityscan-xmp"](VIEWS, tmp_path)
         sidecar = (tmp_path / "0.xmp").read_text()
         text(tmp_path / "2.xmp", re.sub("<xcr:Rotation>.*</xcr:Rotation>", "", sidecar))
-        text(tmp_path / "3.xmp", sidecar.replace('"absolute"', '"relative"'))
+        text(tmp_path / "3.xmp", sidecar.replace('"absolute"', '"relative" xcr:ComponentId="{7}"'))
         text(tmp_path / "lightroom.xmp", '<x:xmpmeta xmlns:x="adobe:ns:meta/"/>')
         capture = parse(tmp_path)
         assert [frame.name for frame in capture.frames] == ["0.jpg", "1.jpg"]
         assert capture.notes == ("2 XMP files without a pose in the scene left out: 2.xmp, 3.xmp",)
+
+    def test_an_export_as_exact_has_poses_in_its_component(self, tmp_path):
+        """Hornacek, On the Coordinate Systems ... by RealityScan: without a component, coordinates are absolute."""
+        WITH_PHOTOS["realityscan-xmp"](VIEWS, tmp_path)
+        for old, new in (('"absolute"', '"relative" xcr:ComponentId="{7}"'), (' xcr:ComponentId="{7}"', "")):
+            for path in tmp_path.glob("*.xmp"):
+                replace_in(path, old, new)
+            capture = parse(tmp_path)
+            np.testing.assert_array_equal([frame.world_from_cam for frame in capture.frames], POSES)
+            assert capture.notes == ()
 
     def test_the_sample_of_the_help_has_all_values_in_attributes(self, tmp_path):
         """RealityScan's help: the rotation -1 0 0 0 0 -1 0 -1 0 looks along -y, with z up and -x to the right."""

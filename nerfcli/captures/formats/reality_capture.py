@@ -15,6 +15,7 @@ nerfstudio process_data/realitycapture_utils.py for the rotation (it takes t1 fo
 import csv
 from collections.abc import Mapping
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -153,17 +154,19 @@ _TERMS = ("k1", "k2", "k3", "k4", "t1", "t2")
 def parse_realityscan_xmp(folder: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the cameras of the photos in a folder, in the coordinates that they were exported in; the unit is arbitrary.
 
-    Files of other programs, or with intrinsics only, and those with coordinates relative to a camera rig give no frame.
+    Files of other programs or with intrinsics only give no frame, nor do those in the coordinates of another component.
     The files do not give the size of the photos, so these are measured.
     """
-    posed, without = [], []
+    scenes, without = dict[str, list[tuple[Path, dict[str, str]]]](), []
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() == _SUFFIX and _NAMESPACE in path.read_bytes():
             value = _values(path)
-            has_pose = {"Rotation", "Position"} <= set(value) and value.get("Coordinates") not in ("relative", "rigid")
-            (posed if has_pose else without).append((path, value))
-    if not posed:
+            has_pose = {"Rotation", "Position"} <= set(value)
+            (scenes.setdefault(_component(value), []) if has_pose else without).append((path, value))
+    if not scenes:
         raise malformed(folder, "its XMP files have no poses", "align the photos, and export XMP with poses")
+    posed = max(scenes.values(), key=len)
+    without += chain.from_iterable(scene for scene in scenes.values() if scene is not posed)
     found = find_photos([path.stem for path, _ in posed], [folder], given=given.images).required(folder)
     fits, poses, frames = Fits(), FramePoses(), []
     for (path, value), image in zip(posed, found.paths, strict=True):
@@ -177,6 +180,11 @@ def parse_realityscan_xmp(folder: Path, given: UserInputs = UserInputs()) -> Cap
         names = listed([path.name for path, _ in without])
         notes.append(f"{several(len(without), 'XMP file')} without a pose in the scene left out: {names}")
     return Capture(tuple(frames), missing=found.missing, kind="realityscan-xmp", notes=tuple(notes))
+
+
+def _component(value: dict[str, str]) -> str:
+    """Return the component whose coordinates the pose is in, or nothing where these are absolute."""
+    return value.get("ComponentId", "") if value.get("Coordinates") in ("relative", "rigid") else ""
 
 
 def _values(path: Path) -> dict[str, str]:
