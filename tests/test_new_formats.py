@@ -184,6 +184,14 @@ class TestRealityScanXmp:
         assert frame.camera == Camera("PINHOLE", 64, 48, (32, 32, 32, 24))
         np.testing.assert_array_equal(pixels(capture, np.array([[1.0, 1, 3], [0.5, 1, 3.5]])), [[32, 24], [48, 8]])
 
+    @pytest.mark.parametrize("tag", ['xcr:DistortionModel="none"', 'xcr:DistortionModel="perspective"', ""])
+    def test_coefficients_count_for_nothing_without_a_model(self, tmp_path, tag):
+        WITH_PHOTOS["realityscan-xmp"](VIEWS, tmp_path)
+        for path in tmp_path.glob("*.xmp"):
+            replace_in(path, "0 0 0 0 0 0", "0.1 0 0 0 0 0")
+            replace_in(path, 'xcr:DistortionModel="brown3"', tag)
+        assert parse(tmp_path).frames[0].camera.model == "PINHOLE"
+
     @pytest.mark.parametrize(
         ("old", "new", "what"),
         [

@@ -147,7 +147,8 @@ TABLE = Format("reality-capture", "RealityScan, RealityCapture", ".csv", find_re
 _XMP_EXPECTED = "expected an XMP file that RealityScan exported"
 _NAMESPACE = b"capturingreality.com/ns/xcr"
 _SUFFIX = ".xmp"
-_MODELS = ("perspective", "brown3", "brown3t2", "brown4", "brown4t2")
+_UNDISTORTED = ("none", "perspective")
+_BROWN = ("brown3", "brown3t2", "brown4", "brown4t2")
 _TERMS = ("k1", "k2", "k3", "k4", "t1", "t2")
 
 
@@ -220,8 +221,10 @@ def _camera(value: dict[str, str], size: tuple[int, int], where: str, fits: Fits
         raise malformed(where, f"ProjectionModel is {shown(projection)}", "only perspective pictures are supported")
     words = value.get("DistortionCoeficients", "0 0 0 0 0 0").split()
     terms = dict(zip(_TERMS, numbers(words, 6, f"{where}: DistortionCoeficients"), strict=True))
-    model = value.get("DistortionModel", "perspective").lower()
-    if model not in _MODELS and any(terms.values()):
+    model = value.get("DistortionModel", "none").lower()
+    if model in _UNDISTORTED:
+        terms = dict.fromkeys(_TERMS, 0.0)
+    elif model not in _BROWN and any(terms.values()):
         hint = "set Alignment Settings > Advanced > Distortion model to Brown3, align, and export again"
         raise malformed(where, f"DistortionModel is {shown(model)}, which is not supported", hint)
     intrinsics = {
