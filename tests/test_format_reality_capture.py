@@ -15,6 +15,7 @@ OLD = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"
 NEW = "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2"
 RADIAL = {"k1": 0.11, "k2": -0.05, "k3": 0.012, "k4": 0}
 LENS = {"f": 28.5, "px": 0.013, "py": -0.0071, **RADIAL, "t1": 0.0011, "t2": -0.0023}
+DIVISION = {**LENS, "k1": -0.38, **dict.fromkeys(("k2", "k3", "t1", "t2"), 0)}
 SIZES = {"wide": (64, 48), "tall": (48, 64)}
 
 
@@ -112,6 +113,7 @@ def test_names_photos_and_a_line_before_the_header(tmp_path):
         ((row("a.jpg"), row("b.jpg").replace("28.5", "wide")), OLD, "line 3: 'wide' is not a number"),
         ((row("a.jpg", (1, 2, float("inf"), 0, 0, 0)),), OLD, "line 2: 'inf' is not finite"),
         ((row("a.jpg", lens={**LENS, "f": 0.0}),), OLD, "line 2: .*invalid parameters"),
+        ((row("a.jpg"), row("b.jpg", lens=DIVISION)), OLD, "line 3: has k1 alone, as of the Division model"),
         ((row("a.jpg"), row("a.jpg")), OLD, "'a.jpg' is listed twice"),
         ((row(""),), OLD, "line 2: the image's name is ''"),
         ((row('"a.jpg'),), OLD, "line 2: is not a valid line of a table"),

@@ -44,15 +44,23 @@ _COLUMNS = {
     "py": ("py", "py_norm"),
     **{key: (key,) for key in ("name", "x", "y", "alt", "pitch", "roll", "k1", "k2", "k3", "k4", "t1", "t2")},
 }
-_NUMBERS = ("x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+_TERMS = ("k1", "k2", "k3", "k4", "t1", "t2")
+_NUMBERS = ("x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", *_TERMS)
+# For the division model, the paper on RealityScan's camera geometry (M. Hornacek, 2026, equation 50) has
+# distorted = undistorted/(1 + k1 r^2) with r of the undistorted point, so that a barrel has k1 > 0. But what it exports
+# for fisheye lenses, and its table of sensors for a GoPro, have k1 < 0: as in undistorted = distorted/(1 + k1 r^2).
+_BROWN3 = (
+    "align with Brown3 (Alignment Settings > Advanced > Distortion model) and export again, or export as COLMAP with "
+    "undistorted images"
+)
 
 
 def parse_reality_capture(path: Path, given: UserInputs = UserInputs()) -> Capture:
     """Read the cameras of the file, in the coordinates that it was exported in (z up); the unit stays arbitrary.
 
     The file does not give the size of the photos, so they are measured; those that are not on disk are `missing`.
-    Distortion must be of one of the Brown models: the division model gives k1 another meaning, and the file does not
-    say which model it is.
+    Distortion must be of one of the Brown models. The file does not say which model it is, but no other has k1 alone:
+    RealityScan fits three radial terms or more of Brown's.
     """
     names, rows, places, lost = _table(path)
     found = find_photos(names, (path.parent,), given=given.images).required(path)
@@ -64,6 +72,9 @@ def parse_reality_capture(path: Path, given: UserInputs = UserInputs()) -> Captu
     for index, (name, image) in enumerate(zip(found.names, found.paths, strict=True)):
         if image is not None:
             intrinsics: dict[str, float] = dict(zip(_NUMBERS[6:], rows[index, 6:].tolist(), strict=True))
+            if intrinsics["k1"] and not any(intrinsics[key] for key in _TERMS[1:]):
+                hint = f"if it is another model, export XMP sidecars, which name it; else {_BROWN3}"
+                raise malformed(places[index], "has k1 alone, as of the Division model, which is not supported", hint)
             camera = camera_of_values(intrinsics, stored_size(image), places[index], fits)
             frames.append(Frame(name, camera, poses[index], image=image))
     notes = (*found.notes, *lost, *fits.notes())
@@ -149,7 +160,6 @@ _NAMESPACE = b"capturingreality.com/ns/xcr"
 _SUFFIX = ".xmp"
 _UNDISTORTED = ("none", "perspective")
 _BROWN = ("brown3", "brown3t2", "brown4", "brown4t2")
-_TERMS = ("k1", "k2", "k3", "k4", "t1", "t2")
 
 
 def parse_realityscan_xmp(folder: Path, given: UserInputs = UserInputs()) -> Capture:
@@ -225,8 +235,7 @@ def _camera(value: dict[str, str], size: tuple[int, int], where: str, fits: Fits
     if model in _UNDISTORTED:
         terms = dict.fromkeys(_TERMS, 0.0)
     elif model not in _BROWN and any(terms.values()):
-        hint = "set Alignment Settings > Advanced > Distortion model to Brown3, align, and export again"
-        raise malformed(where, f"DistortionModel is {shown(model)}, which is not supported", hint)
+        raise malformed(where, f"DistortionModel is {shown(model)}, which is not supported", _BROWN3)
     intrinsics = {
         "f": number("FocalLength35mm", ""),
         "px": number("PrincipalPointU", "0"),
