@@ -196,6 +196,13 @@ def test_the_mask_of_a_photo_that_is_missing_is_not_taken_for_it(tmp_path):
     assert levels(find(tmp_path, ["a.jpg", "b.jpg"], given=tmp_path).paths) == [0, None]
 
 
+@pytest.mark.parametrize("listed", ["{}.png", "{}.PNG", "C:\\trip\\{}.png", "/home/x/images/{}.jpg"])
+@pytest.mark.parametrize("beside", ["images/masks/{}.png", "images/thumbs/{}.png"])
+def test_a_file_in_a_folder_within_that_of_the_photos_is_not_taken_for_one_that_is_missing(listed, beside, tmp_path):
+    photos(tmp_path, [*(f"images/{name}.png" for name in "ab"), *map(beside.format, "abc")])
+    assert levels(find(tmp_path, [listed.format(name) for name in "abc"]).paths) == [0, 1, None]
+
+
 @pytest.mark.parametrize("write", [colmap, transforms])
 @pytest.mark.parametrize("listed", ["../images/{{}}.png", "{folder}/images/{{}}.png", "images/{{}}.png"])
 def test_photos_are_only_taken_from_the_folder_that_the_user_gives(write, listed, tmp_path):

@@ -173,11 +173,8 @@ def search_of(place: Place, names: Sequence[Name], sizes: Sequence[Size | None] 
     if exact < len(names):
         photos, taken = place.photos(), {path for path in paths if path is not None}
         claims: dict[Path, list[tuple[tuple[int, ...], int]]] = {}
-        for index, name in enumerate(names):
-            if paths[index] is not None:
-                continue
-            score, best = _matches(name, photos, place, has_exact=exact > 0)
-            candidates = [path for path in best if path not in taken]
+        for index, (score, best) in _matched(names, paths, photos, place).items():
+            name, candidates = names[index], [path for path in best if path not in taken]
             if len(candidates) > 1 and sizes is not None:
                 candidates = [path for path in candidates if _fit(path, sizes[index]).has_shape]
             if len(candidates) > 1:
@@ -217,7 +214,23 @@ def search_of(place: Place, names: Sequence[Name], sizes: Sequence[Size | None] 
     return Search(place, paths, problems, unfit, (has_shape, len(found), not place.is_reduced, has_size, exact))
 
 
-def _matches(name: Name, photos: Photos, place: Place, *, has_exact: bool) -> tuple[tuple[int, ...], list[Path]]:
+def _matched(
+    names: Sequence[Name], exact: Sequence[Path | None], photos: Photos, place: Place
+) -> dict[int, tuple[tuple[int, ...], list[Path]]]:
+    """Return the best score of photos for each name that has no exact one, and the photos that have it.
+
+    Where one lies as it is listed, all do: the folders that the names lack then hold masks, previews or rejected photos
+    of the same names.
+    """
+    missing = [index for index, path in enumerate(exact) if path is None]
+    as_listed = len(missing) < len(names)
+    found = {index: _matches(names[index], photos, place, as_listed=as_listed) for index in missing}
+    if not as_listed and any(score[1:2] == (True,) for score, _ in found.values()):
+        found = {index: _matches(names[index], photos, place, as_listed=True) for index in missing}
+    return found
+
+
+def _matches(name: Name, photos: Photos, place: Place, *, as_listed: bool) -> tuple[tuple[int, ...], list[Path]]:
     """Return the best score of photos for a name, and the photos that have it."""
     by_folder = next((photos[stem] for stem in name.stems if stem in photos), {})
     # The last folder decides first. With a folder for each photo, all photos may have the same name.
@@ -225,7 +238,7 @@ def _matches(name: Name, photos: Photos, place: Place, *, has_exact: bool) -> tu
     scored: dict[tuple[int, ...], list[Path]] = {}
     for candidates in (in_last, itertools.chain.from_iterable(by_folder.values())):
         for parts in candidates:
-            if (score := _score(name, parts, has_exact=has_exact)) is not None:
+            if (score := _score(name, parts, as_listed=as_listed)) is not None:
                 scored.setdefault(score, []).append(place.path.joinpath(*parts))
         if scored:
             break
@@ -233,15 +246,19 @@ def _matches(name: Name, photos: Photos, place: Place, *, has_exact: bool) -> tu
     return best, scored.get(best, [])
 
 
-def _score(name: Name, parts: tuple[str, ...], *, has_exact: bool) -> tuple[int, ...] | None:
-    """Return how well the parts of a photo's path fit a name, to compare with others; None if they do not."""
+def _score(name: Name, parts: tuple[str, ...], *, as_listed: bool) -> tuple[int, ...] | None:
+    """Return how well the parts of a photo's path fit a name, to compare with others; None if they do not.
+
+    Args:
+        as_listed: whether the photo must be in no folder that the name lacks.
+    """
     folders = [folded(part) for part in parts[:-1]]
     common = 0
     while common < min(len(folders), len(name.folders)) and folders[-1 - common] == name.folders[-1 - common]:
         common += 1
     left = name.folders[: len(name.folders) - common]
-    # A folder that the name lacks may be that of rejected photos, where others lie as they are listed.
-    if not name.is_absolute and len(folders) > common and (has_exact or not all(map(_is_image_folder, left))):
+    may_lie_deeper = name.is_absolute or all(map(_is_image_folder, left))
+    if len(folders) > common and (as_listed or not may_lie_deeper):
         return None
     file = PurePosixPath(parts[-1])
     suffix, listed = file.suffix.lower(), name.plain.rpartition("/")[2]
