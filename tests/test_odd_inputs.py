@@ -231,6 +231,15 @@ def test_a_conversion_names_missing_photos_and_fails_without_any(write, tmp_path
 
 
 @pytest.mark.parametrize("write", [colmap, transforms])
+@pytest.mark.parametrize("again", ["images/../images/0.png", "{folder}/images/0.png"])
+def test_a_photo_with_two_cameras_is_refused_under_any_names(write, again, tmp_path):
+    photos(tmp_path / "images", numbered("{}.png"))
+    write(tmp_path, ["images/0.png", again.format(folder=tmp_path), *numbered("images/{}.png")[2:]])
+    with pytest.raises(UserError, match=r"'images/0\.png' and '.* are the same photo"):
+        parse(tmp_path)
+
+
+@pytest.mark.parametrize("write", [colmap, transforms])
 def test_a_conversion_refuses_cameras_of_another_shape_than_their_photos(write, tmp_path):
     """As training does. Poses alone can be written; a photo that EXIF mirrors or that is damaged is left to others."""
     photos(tmp_path / "images", numbered("{}.png"), size=SIZE[::-1])

@@ -4,6 +4,7 @@ Each format is a file of this folder with one `Format` at its end; `registry` li
 names of files in it, a file by its suffix and its beginning.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.formats.fields import check_unique_names, opened, read_json_object
+from nerfcli.captures.formats.fields import check_unique_names, malformed, opened, read_json_object, shown
 from nerfcli.errors import UserError
 
 
@@ -78,11 +79,26 @@ class Format:
     video: Callable[[Path], Path | None] = lambda path: None
 
     def parse(self, found: Path, given: UserInputs = UserInputs()) -> Capture:
-        """Read what `find` found, or what `write` wrote; without frames, or with two of one name, it is refused."""
+        """Read what `find` found, or what `write` wrote.
+
+        Raises:
+            UserError: it cannot be read, it has no frames, or two frames have one name or photo.
+        """
         capture = self.read(found, given)
         if "poses" not in self.lacks:
             check_unique_names((frame.name for frame in capture.frames), found)
+            _check_unique_photos(capture, found)
         return capture
+
+
+def _check_unique_photos(capture: Capture, found: Path) -> None:
+    """Check that no photo has two cameras, under names such as a.jpg and x/../a.jpg."""
+    names: dict[str, str] = {}
+    for frame in capture.frames:
+        other = names.setdefault(os.path.abspath(frame.image), frame.name) if frame.image else frame.name
+        if other != frame.name and frame.has_photo:
+            what = f"{shown(other)} and {shown(frame.name)} are the same photo"
+            raise malformed(found, what, "remove one of these two entries")
 
 
 def named(*names: str) -> Callable[[Path], Path | None]:
