@@ -503,6 +503,13 @@ def test_two_keys_that_give_different_focal_lengths_are_said(tmp_path):
     assert read_again(tmp_path, fisheye).notes == ()
 
 
+def test_photos_of_a_split_that_are_none_of_the_file_are_said(tmp_path):
+    content = written(tmp_path, train_filenames=numbered(".\\{}.png")[1:], test_filenames=["0.png", "lost.png"])
+    capture = read_again(tmp_path, content)
+    assert [frame.split for frame in capture.frames] == ["test", *["train"] * (COUNT - 1)]
+    assert capture.notes == ("1 photo of a split of transforms.json not among its frames: lost.png",)
+
+
 @pytest.mark.parametrize("listed", ["C:\\out\\points.ply", "Points.PLY", "file:///out/%70oints.ply"])
 def test_a_cloud_of_points_is_found_beside_the_file(listed, tmp_path):
     write_points(CAPTURE, tmp_path / "points.ply")

@@ -154,6 +154,10 @@ def listed_frames(
         path, listed, "depth_file_path", "depth map", places=(home, "depth"), photos=set(places)
     )
     splits = _listed_splits(path, content)
+    unknown = sorted(splits.keys() - set(map(plain_name, texts)))
+    lost_splits = (
+        f"{several(len(unknown), 'photo')} of a split of {path.name} not among its frames: {in_words(unknown)}",
+    )
     cameras: dict[Camera, Camera] = {}
     fits, poses = Fits(), FramePoses()
     frames, missing, used = [], [], []
@@ -171,8 +175,8 @@ def listed_frames(
         camera = cameras.setdefault(camera, camera)
         frames.append(Frame(names[index], camera, pose, places[index], masks[index], split=split, depth=depth))
         used.append((record, camera))
-    notes = (*found.notes, *poses.notes(), *contradictions(used), *fits.notes(), *lost_masks, *lost_depths)
-    return frames, missing, notes
+    lost = (*lost_masks, *lost_depths, *(lost_splits if unknown else ()))
+    return frames, missing, (*found.notes, *poses.notes(), *contradictions(used), *fits.notes(), *lost)
 
 
 def _beside(
