@@ -520,9 +520,10 @@ def test_a_cloud_of_points_is_found_beside_the_file(listed, tmp_path):
 
 def test_empty_texts_of_a_template_are_no_numbers_and_no_masks(tmp_path):
     content = written(tmp_path, k1="", k2="", camera_angle_x="", camera_model=" pinhole ", mask_path=" ")
-    capture = read_again(tmp_path, content)
-    assert {frame.camera for frame in capture.frames} == {PINHOLE}
-    assert capture.notes == ()
+    for model in (" pinhole ", "", " "):
+        capture = read_again(tmp_path, content | {"camera_model": model})
+        assert {frame.camera for frame in capture.frames} == {PINHOLE}
+        assert capture.notes == ()
     for frame in content["frames"]:
         frame |= {"fl_x": "", "cx": "", "cy": None}
     assert {frame.camera for frame in read_again(tmp_path, content).frames} == {PINHOLE}

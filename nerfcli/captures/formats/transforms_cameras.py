@@ -60,7 +60,7 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
     """
     width, height = size
     model = record.get("camera_model")
-    model = model.strip().upper() if isinstance(model, str) else model
+    model = model.strip().upper() or None if isinstance(model, str) else model
     if model == "EQUIRECTANGULAR":
         return checked_camera(model, *size, size, where=where)
     foreign = next((key for key in _FOREIGN if record.get(key) not in (None, False)), None)
