@@ -646,7 +646,7 @@ def test_the_undistorted_copy_in_a_workspace_of_colmap_is_found(folder, tmp_path
 
 
 @pytest.mark.parametrize("order", ["utf-16-le", "utf-16-be"])
-@pytest.mark.parametrize("form", ["transforms", "colmap-text", "reality-capture", "pose-files"])
+@pytest.mark.parametrize("form", ["transforms", "colmap-text", "reality-capture", "pose-files", "record3d", "openmvg"])
 def test_files_that_powershell_has_written(order, form, tmp_path):
     """Its > writes UTF-16 with a byte order mark and CRLF."""
     put(form, tmp_path)

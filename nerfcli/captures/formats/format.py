@@ -150,6 +150,7 @@ def find_json(path: Path, *, opening: str, name: str) -> Path | None:
 def has_keys(path: Path, *keys: str) -> bool:
     """Return whether a file is a JSON object with these keys; it is parsed only if it contains the first of them."""
     try:
-        return f'"{keys[0]}"'.encode() in path.read_bytes() and set(keys) <= set(read_json_object(path))
+        letters = path.read_bytes().replace(b"\0", b"")  # of UTF-16, too
+        return f'"{keys[0]}"'.encode() in letters and set(keys) <= set(read_json_object(path))
     except UserError:  # damaged, or another program's file of this name
         return False
