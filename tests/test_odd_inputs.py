@@ -219,6 +219,17 @@ def test_photos_are_only_taken_from_the_folder_that_the_user_gives(write, listed
 
 
 @pytest.mark.parametrize("write", [colmap, transforms])
+@pytest.mark.parametrize("listed", ["images/VIEW_{}.PNG", "images/view_{}.jpg", "C:\\x\\view_{}.png", "images/view_{}"])
+def test_photos_under_other_names_make_a_scene(write, listed, tmp_path):
+    """Renaming them as they are on disk, which is said, is no loss that must be allowed."""
+    photos(tmp_path, numbered("images/view_{}.png"))
+    write(tmp_path, numbered(listed))
+    assert "found under other names" in completed("convert", tmp_path, tmp_path / "scene", "--to", "nerfcli").stderr
+    images = [frame.image for frame in parse(tmp_path / "scene").frames]
+    assert images == [tmp_path / name for name in numbered("images/view_{}.png")]
+
+
+@pytest.mark.parametrize("write", [colmap, transforms])
 def test_a_conversion_names_missing_photos_and_fails_without_any(write, tmp_path):
     photos(tmp_path / "images", numbered("{}.png")[2:])
     write(tmp_path, numbered("images/{}.png"))

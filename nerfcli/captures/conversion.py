@@ -198,7 +198,8 @@ def accepted_losses(capture: Capture, wanted: TargetOptions, others: tuple[str, 
     # refuse.
     refused = (*others, *form.losses(replace(capture, observations=None)))
     if refused and not wanted.allow_loss:
-        hint = "add --allow-loss to drop that, or use another format, such as nerfcli, which holds the most"
+        other = "" if form.name == "nerfcli" else ", or use another format, such as nerfcli, which holds the most"
+        hint = f"add --allow-loss to drop that{other}"
         raise UserError(f"{form.name} cannot hold everything in this capture; it would lose: {'; '.join(losses)}", hint)
     return losses
 

@@ -19,6 +19,7 @@ from nerfcli.captures.formats.colmap import MODEL_FILES, parse_colmap, read_mode
 from nerfcli.captures.formats.fields import malformed, read_json_object
 from nerfcli.captures.formats.format import Format, UserInputs, folder_with
 from nerfcli.captures.formats.photo_names import seen_from, with_photos
+from nerfcli.captures.formats.photo_search import Name
 from nerfcli.captures.holdout import default_split
 from nerfcli.captures.orientation import UPRIGHT
 from nerfcli.errors import UserError, in_shell
@@ -212,8 +213,15 @@ def losses_scene(capture: Capture) -> tuple[str, ...]:
     without a file are reported when the scene is loaded.
     """
     _, names = _named(capture)
-    renamed = sum(frame.name != name for frame, name in zip(capture.frames, names, strict=True))
+    renamed = sum(_is_other(frame.name, name) for frame, name in zip(capture.frames, names, strict=True))
     return (f"the names of {renamed} photos, which become paths relative to one folder",) if renamed else ()
+
+
+def _is_other(listed: str, name: str) -> bool:
+    """Return whether a name is not the end of a listed one, but for what `find_photos` ignores, such as a suffix."""
+    old, new = Name.of(listed), Name.of(name)
+    end = old.folders[len(old.folders) - len(new.folders) :]
+    return end != new.folders or set(old.stems).isdisjoint(new.stems)
 
 
 def write_scene(capture: Capture, folder: Path) -> None:
