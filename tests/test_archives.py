@@ -102,6 +102,21 @@ def test_another_archive_of_this_name_replaces_the_files_only_if_it_may(tmp_path
         unpack(path, tmp_path / "scene", overwrite=True)
 
 
+def test_a_note_beside_the_folder_of_a_capture_is_passed_over(tmp_path):
+    WITH_PHOTOS["kapture"](VIEWS, tmp_path / "made")
+    path = packed(tmp_path / "made", tmp_path / "scan.zip", inside="my scan/")
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("README.txt", "a scan")
+    assert unpack(path, tmp_path / "scene") == tmp_path / "scan-unpacked/my scan"
+
+
+def test_a_folder_of_nothing_but_an_archive_says_so(tmp_path):
+    zipped(tmp_path / "scan.ZIP", entry("a.txt"), content="")
+    with pytest.raises(UserError, match="contains no capture") as caught:
+        recognise(tmp_path)
+    assert caught.value.hint == f"there is an archive in it: nerfcli convert {tmp_path / 'scan.ZIP'} SCENE --to nerfcli"
+
+
 def test_separators_of_windows_are_read(tmp_path):
     folder = unpack(zipped(tmp_path / "scan.zip", entry("scan\\images\\a.txt"), content="good"), tmp_path / "scene")
     assert (folder / "a.txt").read_text() == "good"

@@ -158,10 +158,10 @@ def _extract(
 
 
 def _innermost(folder: Path) -> Path:
-    """Return the folder that has the capture: archives often hold one folder, which holds the files."""
+    """Return the folder that has the capture: archives often hold one folder, which holds the files, and a note."""
     while recognised(folder) is None and photo_folder(folder) is None:
-        inside = [path for path in folder.iterdir() if path.name != ARCHIVE_FILE]
-        if len(inside) != 1 or not inside[0].is_dir():
+        inside = [path for path in folder.iterdir() if path.is_dir()]
+        if len(inside) != 1:
             break
         folder = inside[0]
     return folder

@@ -105,6 +105,9 @@ def recognise(path: Path) -> tuple[Format, Path]:
         other = f"those of {in_shell(above)} are used if you give that folder, or " if recognised(above) else ""
         hint = f"{other}estimate them with: nerfcli poses {in_shell(photos)}"
         raise UserError(f"{photos} has {several(len(list_images(photos)), 'photo')} but no cameras", hint)
+    if packed := [item for item in sorted(path.iterdir() if path.is_dir() else ()) if item.suffix.lower() in ARCHIVES]:
+        hint = f"there is an archive in it: nerfcli convert {in_shell(packed[0])} SCENE --to nerfcli"
+        raise UserError(f"{path} contains no capture", hint)
     usual = ", ".join(form.looked_for for form in FORMATS if form.name in ("nerfcli", "colmap", "transforms"))
     hint = f"looked for {usual} and the files of many more programs: nerfcli convert --help lists them"
     raise UserError(f"{path} contains no capture in a supported format", hint)
