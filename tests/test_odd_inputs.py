@@ -33,6 +33,7 @@ from nerfcli.captures.formats.lenses import Fits, Terms
 from nerfcli.captures.formats.photo_names import find_photos
 from nerfcli.captures.formats.ply import write_points
 from nerfcli.captures.formats.registry import with_masks
+from nerfcli.captures.loading import load_scene
 from nerfcli.errors import UserError
 
 CAPTURE = capture_of([PINHOLE])
@@ -302,6 +303,25 @@ def test_photos_of_one_name_in_folders_of_their_own_are_found_by_these(tmp_path,
     found = find_photos([f"/home/x/images/{index}/rgb.png" for index in range(count)], [tmp_path])
     assert found.paths == tuple(tmp_path / f"images/{index}/rgb.png" for index in range(count))
     assert len(plain) < 40 * count
+
+
+@pytest.mark.parametrize("centre", [(4 * SIZE[0] / 2, 4 * SIZE[1] / 2), (0.5, 0.5), (SIZE[0] / 2, -1.0)])
+def test_a_principal_point_that_is_no_place_in_the_picture_is_said_when_a_scene_is_read(centre, tmp_path):
+    content = written(tmp_path, cx=centre[0], cy=centre[1])
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    (note,) = load_scene(tmp_path).notes
+    assert note.startswith(f"the principal point of {COUNT} photos, such as 0.png, is outside the picture or at its")
+
+
+def test_cameras_at_one_place_are_said_when_a_scene_is_read(tmp_path):
+    """Templates have one pose for all; and none of depth is in photos that a camera took while it only turned."""
+    content = written(tmp_path)
+    for frame in content["frames"]:
+        frame["transform_matrix"] = np.eye(4).tolist()
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert load_scene(tmp_path).notes == (
+        f"all {COUNT} cameras are at the same place, from which no depth can be learned",
+    )
 
 
 # Poses

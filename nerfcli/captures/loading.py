@@ -6,11 +6,13 @@ The world frame is that of its files: it is never rotated, moved or scaled here.
 import hashlib
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats import run_cameras
@@ -22,6 +24,9 @@ from nerfcli.captures.orientation import UPRIGHT, rescaled_sizes, upright
 from nerfcli.errors import UserError, in_shell, several
 from nerfcli.photos.images import list_images
 from nerfcli.photos.masks import masks_inside
+
+# The edge of a picture, as a fraction of its side.
+_EDGE = 0.01
 
 
 def load_scene(path: str | Path, *, holdout: str | None = None) -> Capture:
@@ -126,7 +131,29 @@ def with_photos_on_disk(path: Path, form: Format, found: Path, capture: Capture)
         pixels=UPRIGHT,
         rescaled=rescaled_sizes((frames[index].camera, frame.camera) for index, frame in fitted.items()),
         provenance=capture.provenance or {"from": form.name},
+        notes=(*capture.notes, *doubts([fitted[index] for index in kept])),
     )
+
+
+def doubts(frames: Sequence[Frame]) -> tuple[str, ...]:
+    """Return lines on cameras that are hardly those of the photos, for people; files have such numbers by mistake."""
+    notes = []
+    if len(frames) > 1 and len({frame.centre.tobytes() for frame in frames}) == 1:
+        notes.append(f"all {len(frames)} cameras are at the same place, from which no depth can be learned")
+    outside = [frame.name for frame in frames if not _is_plausible(frame.camera)]
+    if outside:
+        notes.append(
+            f"the principal point of {several(len(outside), 'photo')}, such as {outside[0]}, is outside the picture or "
+            "at its edge; if the intrinsics are for larger pictures, say so with nerfcli convert --from-size (--detect "
+            "finds the factor)"
+        )
+    return tuple(notes)
+
+
+def _is_plausible(camera: Camera) -> bool:
+    """Return whether the principal point is in the picture, and not at its edge, as fractions of the size would be."""
+    places = zip(camera.principal_point, camera.size, strict=True)
+    return all(_EDGE * side <= place <= (1 - _EDGE) * side for place, side in places)
 
 
 def _upright(capture: Capture, frame: Frame) -> Frame:

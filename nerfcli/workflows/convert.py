@@ -21,6 +21,7 @@ from nerfcli.captures.conversion import (
 )
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.registry import refuse_missing_masks
+from nerfcli.captures.loading import doubts
 from nerfcli.captures.orientation import STORED, describe_rescaling, in_pixels, other_sizes
 from nerfcli.captures.world import WorldFrame, in_world_frame
 from nerfcli.errors import UserError, listed, several
@@ -64,7 +65,7 @@ def convert_capture(
         _report_missing(capture, reporter)
     for text in describe_rescaling({} if "cameras" in wanted.form.lacks else other_sizes(capture)):
         reporter.note(f"{text.removesuffix(': rescaled')}; written to {to} unchanged")
-    if text := _describe_outside(capture):
+    for text in doubts(capture.frames):
         reporter.warn(text)
     moved = in_world_frame(capture, world)
     scale = moved.scale
@@ -120,21 +121,6 @@ def _report_missing(capture: Capture, reporter: Reporter) -> None:
         raise UserError(f"none of the {several(count, 'photo')} of the capture is on disk, such as {missing[0]}", hint)
     if missing:
         reporter.warn(f"{len(missing)} of {several(count, 'photo')} missing: {listed(missing)}")
-
-
-def _describe_outside(capture: Capture) -> str | None:
-    """Say which photos have their principal point outside; None if there are none."""
-    outside = []
-    for frame in capture.frames:
-        x, y = frame.camera.principal_point
-        if not (0 <= x <= frame.camera.width and 0 <= y <= frame.camera.height):
-            outside.append(frame.name)
-    if not outside:
-        return None
-    return (
-        f"the principal point of {several(len(outside), 'photo')}, such as {outside[0]}, is outside the picture; if "
-        "the intrinsics are for larger pictures, say so with --from-size (--detect finds the factor)"
-    )
 
 
 def detect_convention(
