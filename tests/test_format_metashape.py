@@ -140,6 +140,12 @@ def test_cameras_by_hand(tmp_path):
     np.testing.assert_allclose(capture.frames[0].world_from_cam, CHUNK_FROM_CAM, rtol=0, atol=1e-15)
 
 
+def test_the_only_export_in_a_folder_is_found_under_any_name(tmp_path):
+    path = write(tmp_path, document(sensor_xml({"f": 500.0}), camera_xml("a"))).rename(tmp_path / "my project.xml")
+    (tmp_path / "lens.xml").write_text('<?xml version="1.0" encoding="UTF-8"?>\n<calibration/>')
+    assert FORMAT.find(tmp_path) == path
+
+
 @pytest.mark.parametrize("place", ["component", "chunk"])
 def test_the_transform_to_the_world_scales_centres_and_keeps_poses_rigid(tmp_path, place):
     if place == "component":

@@ -25,7 +25,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.fields import malformed, matrix_of, name_of, numbers, read_xml, shown, size_of
-from nerfcli.captures.formats.format import Format, by_suffix
+from nerfcli.captures.formats.format import Format, by_suffix, only_file
 from nerfcli.captures.formats.lenses import Fits, Terms
 from nerfcli.captures.formats.limits import FramePoses, checked_camera, largest_of, rigid_pose
 from nerfcli.captures.formats.photo_names import with_photos
@@ -218,10 +218,18 @@ def _words(record: Element, key: str) -> list[str]:
     return (record.findtext(key) or "").split()
 
 
+_BEGINS = '<?xml version="1.0" encoding="UTF-8"?>\n<document '
+
+
+def find_metashape(path: Path) -> Path | None:
+    """Find a file .xml; in a folder, cameras.xml, or the only one that begins as Metashape's, as it has any name."""
+    return by_suffix(".xml", "cameras.xml")(path) or only_file(path, "*.xml", _BEGINS)
+
+
 FORMAT = Format(
     "metashape",
     "Agisoft Metashape",
     ".xml",
-    by_suffix(".xml", "cameras.xml"),
+    find_metashape,
     lambda path, given: with_photos(parse_metashape(path), path.parent, given=given.images),
 )
