@@ -57,6 +57,14 @@ def test_the_folder_around_a_capture_is_given(command, tmp_path):
     assert error_of(nerfcli(command, tmp_path))[1] == hint
 
 
+def test_a_capture_two_folders_down_is_pointed_at(tmp_path):
+    """Such as a model in sparse/aligned, where sparse/0 is expected."""
+    one = project(tmp_path / "one")
+    (one / "sparse/0").rename(one / "sparse/aligned")
+    hint = f"Hint:  there is one in {one / 'sparse/aligned'}: give that folder"
+    assert refusal("train", one) == (f"Error: {one} contains no capture", hint)
+
+
 def test_the_folder_of_photos_in_a_capture_is_given(tmp_path):
     one = project(tmp_path / "one")
     inside = next(path for path in one.iterdir() if path.name != "sparse")

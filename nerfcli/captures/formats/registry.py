@@ -114,12 +114,13 @@ def recognise(path: Path) -> tuple[Format, Path]:
 
 
 def _captures_in(path: Path) -> list[Path]:
-    """Return the folders in a folder which are captures, as far as they can be read."""
-    found = []
-    for folder in sorted(path.iterdir()) if path.is_dir() else ():
-        with suppress(OSError):
-            if folder.is_dir() and recognised(folder) is not None:
-                found.append(folder)
+    """Return the folders in a folder which are captures, or else those one level down, as far as they can be read."""
+    found = list[Path]()
+    for pattern in ("*", "*/*"):
+        for folder in sorted(path.glob(pattern)) if not found else ():
+            with suppress(OSError):
+                if folder.is_dir() and recognised(folder) is not None:
+                    found.append(folder)
     return found
 
 
