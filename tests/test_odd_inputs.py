@@ -689,6 +689,26 @@ def test_files_that_powershell_has_written(order, form, tmp_path):
     np.testing.assert_array_equal(after.points, before.points)
 
 
+@pytest.mark.parametrize("command", [("info",), ("convert", "--to", "nerfcli", "out")])
+def test_a_name_that_is_no_text_is_refused(command, tmp_path):
+    """As JSON and, on Linux, names of files in the code page of an old archive may be."""
+    photos(tmp_path, numbered("{}.png"))
+    transforms(tmp_path, ["caf\udce9.png", *numbered("{}.png")[1:]])
+    error, hint = refusal(command[0], tmp_path, *command[1:])
+    assert "transforms.json: the name 'caf\\udce9.png' is not in UTF-8" in error
+    assert hint.startswith("Hint:  rename it")
+
+
+def test_an_error_has_two_lines_whatever_a_name_holds(tmp_path):
+    """It moves neither the cursor of the terminal nor its colours."""
+    names = numbered("{}\n\x1b[2J.png")
+    photos(tmp_path, names)
+    (tmp_path / names[0]).write_bytes(b"")
+    transforms(tmp_path, names)
+    error, _ = refusal("convert", tmp_path, tmp_path / "out", "--to", "nerfcli")
+    assert error == f"Error: {tmp_path}/0\\n\\x1b[2J.png is empty (0 bytes)"
+
+
 def test_a_name_that_no_file_can_have_is_a_missing_photo(tmp_path):
     photos(tmp_path, numbered("{}.png")[1:])
     transforms(tmp_path, ["x" * 300 + ".png", *numbered("{}.png")[1:]])

@@ -30,6 +30,8 @@ STATES_LEFT = " left"
 _LEAST_DONE = 0.02
 # Error numbers of a full disk and of an exhausted quota. Files that commands write have errors of their own for these.
 _FULL = (errno.ENOSPC, errno.EDQUOT)
+# Names of files may have control characters, which would act on the terminal.
+_CONTROLS = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"}
 # Width of tables in a file or a pipe, which have no width of their own.
 TABLE_WIDTH = 200
 
@@ -180,14 +182,14 @@ class _Clock:
 
 
 def _stderr(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)  # noqa: T201 - the one place that writes to the user
+    print(text.translate(_CONTROLS), file=sys.stderr, flush=True)  # noqa: T201 - the one place that writes to the user
 
 
 def report_error(error: UserError, about: str | None = None) -> None:
     """Print the two lines of an error; `about` is the input that it concerns, if there are several."""
     prefix = "" if about is None or error.message.startswith(about) else f"{about}: "
-    _stderr(f"Error: {prefix}{error.message}")
-    _stderr(f"Hint:  {error.hint}")
+    for line in (f"Error: {prefix}{error.message}", f"Hint:  {error.hint}"):
+        _stderr(line.replace("\n", "\\n"))
 
 
 def command(function: Callable[..., R]) -> Callable[..., R]:

@@ -29,6 +29,8 @@ from nerfcli.captures.formats.limits import MOST_PIXELS, MOST_UNITS, NotFiniteEr
 from nerfcli.errors import UserError
 
 _LONGEST_NAME = 1000
+# What stands for a byte of a file's name that is not UTF-8, or for half a character in JSON.
+_SURROGATE = re.compile("[\ud800-\udfff]")
 # As Python, C and Microsoft's C print it.
 _NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|1\.#)", re.IGNORECASE)
 
@@ -216,9 +218,11 @@ def name_of(value: Any, where: str) -> str:
 
 
 def check_unique_names(names: Iterable[str], path: Path) -> None:
-    """Check that there are frames, and no two with the same name."""
+    """Check that there are frames, and no two with the same name, and that all names are text."""
     seen: set[str] = set()
     for name in names:
+        if _SURROGATE.search(name):
+            raise malformed(path, f"the name {shown(name)} is not in UTF-8", "rename it; old archives have such names")
         if name in seen:
             raise malformed(path, f"image {shown(name)} is listed twice", "remove one of its two entries")
         seen.add(name)
