@@ -518,6 +518,19 @@ def test_a_frame_has_its_own_focal_length_in_either_key(tmp_path):
     np.testing.assert_allclose([frame.camera.focal_lengths for frame in capture.frames], 140.0, rtol=1e-12)
 
 
+def test_a_list_of_distortion_terms_replaces_single_ones(tmp_path):
+    """As in nerfstudio, for the file or for a frame."""
+    content = written(tmp_path, k1=0.3, camera_model="OPENCV", distortion_params=[-0.05, 0.02, 0.0, 0.0, 0.001, -0.002])
+    content["frames"][1]["distortion_params"] = [0.0] * 6
+    first, second, *_ = read_again(tmp_path, content).frames
+    assert first.camera == Camera("OPENCV", *SIZE, (*PINHOLE.params, -0.05, 0.02, 0.001, -0.002))
+    assert second.camera == PINHOLE
+    with pytest.raises(UserError, match="distortion_params is a list of 5"):
+        read_again(tmp_path, content | {"distortion_params": [0.1] * 5})
+    with pytest.raises(UserError, match="camera_model 'FISHEYE624' is not supported"):
+        read_again(tmp_path, content | {"camera_model": "fisheye624", "distortion_params": [0.1] * 12})
+
+
 def test_two_keys_that_give_different_focal_lengths_are_said(tmp_path):
     """nerfstudio and instant-ngp read fl_x; programs write both for the same length, up to rounding."""
     fx = PINHOLE.params[0]

@@ -1,6 +1,7 @@
 """The keys that describe a camera in a transforms.json: fl_x, cx, k1, camera_model, ..., from and to cameras.
 
-Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips.md and src/nerf_loader.cu.
+Sources: docs.nerf.studio "Data conventions"; nerfstudio data/dataparsers/nerfstudio_dataparser.py; instant-ngp
+docs/nerf_dataset_tips.md and src/nerf_loader.cu.
 """
 
 import math
@@ -18,6 +19,8 @@ from nerfcli.captures.formats.unsupported import distortion, projection
 from nerfcli.errors import several
 
 _INTRINSICS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+# A list of terms that replaces those, and their order in it.
+_LIST, _LISTED = "distortion_params", ("k1", "k2", "k3", "k4", "p1", "p2")
 # Keys of a 3x3 matrix of intrinsics.
 _MATRICES = ("K", "intrinsics", "intrinsic_matrix")
 # Keys that give the same number; the first counts.
@@ -66,6 +69,12 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
     foreign = next((key for key in _FOREIGN if record.get(key) not in (None, False)), None)
     if foreign is not None:
         raise malformed(where, f"the lens model of {foreign} is not supported", "undistort the pictures first")
+    if model not in (*_PERSPECTIVE_MODELS, *_FISHEYE_MODELS):
+        supported = ", ".join(str(name) for name in (*_PERSPECTIVE_MODELS[1:], *_FISHEYE_MODELS, "EQUIRECTANGULAR"))
+        raise malformed(where, f"camera_model {model!r:.80} is not supported", f"expected one of {supported}")
+    if record.get(_LIST):
+        values = fields.vector(record, _LIST, len(_LISTED), where)
+        record = record | dict(zip(_LISTED, values.tolist(), strict=True))
     focal, centre, skew = _without_distortion(record, size, where)
     head = (*focal, *centre)
     k1, k2, k3, k4, k5, k6, p1, p2 = (number(record, key, where) or 0.0 for key in _INTRINSICS)
@@ -73,9 +82,6 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
         raise malformed(where, f"k5 is {k5:g} and k6 is {k6:g}", f"only camera_model {_RATIONAL} has these terms")
     if model in _FISHEYE_MODELS or record.get("is_fisheye") is True:
         return fits.fisheye(size, focal, centre, terms=Terms((k1, k2, k3, k4), (p1, p2), skew=skew), where=where)
-    if model not in _PERSPECTIVE_MODELS:
-        supported = ", ".join(str(name) for name in (*_PERSPECTIVE_MODELS[1:], *_FISHEYE_MODELS, "EQUIRECTANGULAR"))
-        raise malformed(where, f"camera_model {model!r:.80} is not supported", f"expected one of {supported}")
     if model == _RATIONAL and (k4 or k5 or k6):
         if skew:
             raise malformed(where, f"skew is {skew:g}, which no lens with k4, k5 and k6 has", "undistort the photos")
