@@ -66,9 +66,10 @@ def test_a_capture_with_photos_is_trained_on(name, tmp_path):
         assert load_scene(file).kind == kind
 
 
-def test_photos_that_a_colmap_model_does_not_place_are_counted(tmp_path):
+@pytest.mark.parametrize("name", ["colmap", "realityscan-xmp"])
+def test_photos_that_a_model_does_not_place_are_counted(name, tmp_path):
     """Regression: a model of 3 of 87 photos was trained on without a word about the others."""
-    WITH_PHOTOS["colmap"](VIEWS, tmp_path)
+    WITH_PHOTOS[name](VIEWS, tmp_path)
     scene = load_scene(tmp_path)
     first = scene.frames[0].image
     assert first is not None

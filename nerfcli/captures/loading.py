@@ -25,6 +25,8 @@ from nerfcli.errors import UserError, in_shell, several
 from nerfcli.photos.images import list_images
 from nerfcli.photos.masks import masks_inside
 
+# Formats that leave out photos without a pose, which lie beside the others.
+_BESIDE_OTHERS = ("colmap", "colmap-text", "realityscan-xmp")
 # The edge of a picture, as a fraction of its side.
 _EDGE = 0.01
 
@@ -197,7 +199,7 @@ def describe_source(path: Path, scene: Capture) -> str:
     form, found = recognise(path)
     there = len(scene.frames)
     text = f"{found}: {form.name} ({form.of}), {there} of {there + len(scene.missing)} photos on disk"
-    folder, without_pose = _without_pose(scene) if scene.kind.startswith("colmap") else (found, [])
+    folder, without_pose = _without_pose(scene) if scene.kind in _BESIDE_OTHERS else (found, [])
     if not without_pose:
         return text
     subfolders = " --subfolders" if any(file.parent != folder for file in without_pose) else ""
