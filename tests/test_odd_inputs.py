@@ -231,6 +231,18 @@ def test_photos_under_other_names_make_a_scene(write, listed, tmp_path):
 
 
 @pytest.mark.parametrize("write", [colmap, transforms])
+@pytest.mark.parametrize("listed", ["images/{}.png", "/home/x/images/{}.png"])
+def test_a_scene_of_which_a_photo_is_missing_has_the_names_and_split_of_the_capture(write, listed, tmp_path):
+    """Every 8th of the photos that are there is held out; that was the missing one."""
+    photos(tmp_path / "images", numbered("{}.png")[1:])
+    write(tmp_path, numbered(listed))
+    completed("convert", tmp_path, tmp_path / "scene", "--to", "nerfcli")
+    before, after = load_scene(tmp_path), load_scene(tmp_path / "scene")
+    assert (after.test_names, after.missing) == (before.test_names, before.missing)
+    assert [frame.image for frame in after.frames] == [frame.image for frame in before.frames]
+
+
+@pytest.mark.parametrize("write", [colmap, transforms])
 def test_a_conversion_names_missing_photos_and_fails_without_any(write, tmp_path):
     photos(tmp_path / "images", numbered("{}.png")[2:])
     write(tmp_path, numbered("images/{}.png"))

@@ -227,8 +227,8 @@ def _is_other(listed: str, name: str) -> bool:
 def write_scene(capture: Capture, folder: Path) -> None:
     """Write a capture, whose cameras are for upright photos, as a scene into a folder.
 
-    Masks are listed one by one. A split in the capture is kept; otherwise every 8th photo is held out. The capture's
-    provenance is recorded beside the command and the version.
+    Masks are listed one by one. A split in the capture is kept; otherwise every 8th photo that is there is held out.
+    The capture's provenance is recorded beside the command and the version.
     """
     image_folder, names = _named(capture)
     capture = replace(
@@ -240,6 +240,9 @@ def write_scene(capture: Capture, folder: Path) -> None:
         pairs = capture.depth_bounds.tolist()
         bounds = {frame.name: (near, far) for frame, (near, far) in zip(capture.frames, pairs, strict=True)}
     split = {frame.name: frame.split for frame in capture.frames}
+    if not {"test", "val"} & set(split.values()):
+        held_out = default_split(frame.name for frame in capture.frames if frame.has_photo)
+        split = {name: "test" if name in held_out else "train" for name in split}
     save(
         folder,
         image_folder=image_folder,
@@ -248,30 +251,35 @@ def write_scene(capture: Capture, folder: Path) -> None:
         unit_source=capture.unit_source,
         masks={frame.name: frame.mask for frame in capture.frames if frame.mask is not None},
         depths={frame.name: frame.depth for frame in capture.frames if frame.depth is not None},
-        split=split if {"test", "val"} & set(split.values()) else None,
+        split=split,
         depth_bounds=bounds,
     )
 
 
 def _named(capture: Capture) -> tuple[Path, list[str]]:
-    """Return a folder of the photos, from which the frames' names lead to them if possible, and their names in it."""
-    images = []
+    """Return a folder of the photos, from which the frames' names lead to them if possible, and their names in it.
+
+    Photos that are not on disk keep the names of their frames.
+    """
+    images = {}
     for frame in capture.frames:
         if frame.image is None:
             hint = "give the photo folder with --images, or convert to another format"
             raise UserError(f"{frame.name} has no photo, which a scene requires", hint)
-        images.append(os.path.abspath(frame.image))
+        images[frame.name] = os.path.abspath(frame.image)
     names = [frame.name for frame in capture.frames]
-    first = names[0].split("/")
-    if images[0].replace(os.sep, "/").endswith("/" + names[0]):
-        root = Path(images[0]).parents[len(first) - 1]
-        if all(os.path.normpath(root / name) == image for name, image in zip(names, images, strict=True)):
+    images = {frame.name: images[frame.name] for frame in capture.frames if frame.has_photo} or images
+    name, image = next(iter(images.items()))
+    if image.replace(os.sep, "/").endswith("/" + name):
+        root = Path(image).parents[len(name.split("/")) - 1]
+        if all(os.path.normpath(root / name) == image for name, image in images.items()):
             return root, names
     try:
-        root = Path(os.path.commonpath([os.path.dirname(image) for image in images]))
+        root = Path(os.path.commonpath([os.path.dirname(image) for image in images.values()]))
     except ValueError as error:  # on several drives
         raise UserError("the photos are on several drives", "put them into one folder") from error
-    return root, [Path(image).relative_to(root).as_posix() for image in images]
+    inside = {name: Path(image).relative_to(root).as_posix() for name, image in images.items()}
+    return root, [inside.get(name, name) for name in names]
 
 
 FORMAT = Format(
