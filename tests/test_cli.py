@@ -834,11 +834,10 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
     assert "resumed at step 1" in first.stderr
     run = tmp_path / "all" / "run"
     expected = [
-        *(tmp_path / "all" / "scene", run, run / "metrics.json"),
-        *(run / "metrics-run-splats.ply.json", tmp_path / "all" / "run-splats.ply"),
-        *(run / "renders" / "test-conditional-z" / name for name in ("rgb", "depth", "opacity")),
+        *(tmp_path / "all" / "scene", run, tmp_path / "all" / "run-splats.ply"),
         *(run / "renders" / "orbit-conditional-z-splats" / f"{name}.mp4" for name in ("rgb", "depth")),
-        run / "report.html",
+        *(run / "metrics.json", run / "metrics-run-splats.ply.json", run / "report.html"),
+        *(run / "renders" / "test-conditional-z" / name for name in ("rgb", "depth", "opacity")),
     ]
     assert first.exit_code == 0, first.stderr
     assert first.stderr.count("LPIPS is not available") <= 1  # none where it is installed

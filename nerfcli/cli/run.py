@@ -1,4 +1,4 @@
-"""nerfcli run: all stages, from photos to splats, a video and a report."""
+"""nerfcli run: all stages, from photos to splats, a video, a report and depth maps."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +33,7 @@ def run(
     require: options.Require = None,
     printing: options.Printing,
 ) -> None:
-    """Run all stages: poses, train, evaluate, splats, video, report.
+    """Run all stages: poses, train, splats, video, evaluate, report.
 
     Writes PHOTOS-scene/, PHOTOS-scene-run/ and PHOTOS-scene-run-splats.ply next to the photos, or scene/, run/ and
     run-splats.ply inside --output. A capture with poses, such as a COLMAP project or a folder with transforms.json, is

@@ -1,4 +1,4 @@
-"""All stages in one call: poses, training, evaluation, splats, pictures, report."""
+"""All stages in one call: poses, training, splats, video, evaluation, report, pictures."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -62,7 +62,7 @@ def run_pipeline(
     reporter: Reporter = Reporter(),
     show: Callable[[Path | Evaluation], None] = lambda result: None,
 ) -> PipelineResult:
-    """Go from photos to a trained field, its metrics, splats, pictures, a video and a report; keep completed stages.
+    """Go from photos to a trained field, splats, a video, metrics, a report and pictures; keep completed stages.
 
     Example:
         >>> import nerfcli
@@ -117,17 +117,20 @@ def run_pipeline(
     if capture is None:
         show(scene)
     show(run.path)
-    evaluation = results.metrics()
-    splats = of_splats = None
+    # Splats and their video first: the rest takes minutes where many photos are held out.
+    splats = None
     if any(frame.camera.is_spherical for frame in run.cameras.train):
         reporter.note("360-degree photos have no splats; the video is made from the field")
     else:
         seconds = (settings.budget_seconds or 2 * SplatSettings.budget_seconds) / 2
-        splats, of_splats = results.splats(SplatSettings(budget_seconds=seconds, resume=None))
-    renders = results.pictures(Views("test"), RenderSettings(OUTPUTS[:3], usual_depth(run, Views("test"))))
+        splats = results.splats(SplatSettings(budget_seconds=seconds, resume=None))
     orbit = RenderSettings(OUTPUTS[:2], usual_depth(run, Views("orbit")), video=VideoSettings())
-    renders += results.pictures(Views("orbit"), orbit, splats=splats)
-    return PipelineResult(scene, run, evaluation, splats, of_splats, renders, results.report())
+    videos = results.pictures(Views("orbit"), orbit, splats=splats)
+    evaluation = results.metrics()
+    of_splats = None if splats is None else results.metrics_of_splats(splats)
+    report = results.report()
+    pictures = results.pictures(Views("test"), RenderSettings(OUTPUTS[:3], usual_depth(run, Views("test"))))
+    return PipelineResult(scene, run, evaluation, splats, of_splats, [*pictures, *videos], report)
 
 
 @dataclass(frozen=True)
@@ -154,20 +157,25 @@ class _Results:
         self.show(evaluation)
         return evaluation
 
-    def splats(self, settings: SplatSettings) -> tuple[Path, Evaluation]:
-        """Export splats of the field as .ply, and evaluate them."""
+    def splats(self, settings: SplatSettings) -> Path:
+        """Export splats of the field as .ply."""
         run, splats = self.run.path, default_target(self.run.path, "splats")
         is_old = splats.exists() and not are_of(splats, self.run)
         if self.again or is_old or not splats.exists():
             output = Output(overwrite=self.again or is_old)
             with self.reporter.stage("export splats") as stage:
                 export_run(run, output, to="splats", splats=settings, resources=self.resources, reporter=stage)
-        output = self._replacing(run / f"metrics-{splats.name}.json", {"checkpoint_sha256": file_digest(splats)})
+        self.show(splats)
+        return splats
+
+    def metrics_of_splats(self, splats: Path) -> Evaluation:
+        """Evaluate the splats."""
+        run, digest = self.run.path, file_digest(splats)
+        output = self._replacing(run / f"metrics-{splats.name}.json", {"checkpoint_sha256": digest})
         with self.reporter.stage("evaluate splats") as stage:
             evaluation = evaluate_splats(run, splats, output, resources=self.resources, reporter=stage)
         self.show(evaluation)
-        self.show(splats)
-        return splats, evaluation
+        return evaluation
 
     def pictures(self, views: Views, settings: RenderSettings, *, splats: Path | None = None) -> list[Path]:
         """Render views of the splats, or else of the field."""
