@@ -17,6 +17,7 @@ from nerfcli.evaluate import depth_errors
 from nerfcli.evaluate.depth_errors import measure_depth_errors, surface_tracks
 from nerfcli.matching.stereo import DenseDepth
 from nerfcli.matching.tracks import Tracks, triangulate
+from nerfcli.photos.images import write_png
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.render.coverage import depth_maps
 from nerfcli.render.depth import DepthRequest
@@ -24,7 +25,7 @@ from nerfcli.render.depth_errors import LEAST_PIXELS, DepthErrors
 from nerfcli.render.files.file_facts import depth_meta_of
 from nerfcli.render.files.float_maps import read_exr
 from nerfcli.render.pictures import render_picture
-from nerfcli.training.runs.files import DEPTH_ERRORS
+from nerfcli.training.runs.files import DEPTH_ERRORS, left_out_mask
 from nerfcli.training.runs.run import Run
 
 TRUTH = Path(__file__).parent.parent / "sample_scenes" / "spheres" / "truth"
@@ -119,6 +120,27 @@ def test_errors_are_those_between_matched_and_median_distances(spheres_run, monk
     assert 0.9 * len(every) < sum(found.pixels) <= len(every)
     # Nearly all pixels are in the last stratum.
     np.testing.assert_allclose(found.quantiles[2][20:181], np.quantile(every, np.linspace(0.1, 0.9, 161)), atol=0.01)
+
+
+def test_pixels_that_the_training_left_out_are_not_measured(copied, monkeypatch):
+    """Regression: what is attached to the camera was matched, and its depth held against the field."""
+    run, matched = Run(copied), list[LoadedPhoto]()
+    left_out = [run.cameras.train[2].name, run.cameras.test[1].name]
+    kept = np.tile(np.arange(96) >= 40, (72, 1))
+    for name in left_out:
+        write_png(left_out_mask(copied, name), np.where(kept, 255, 0).astype(np.uint8))
+
+    def dense_depths(photos: Sequence[LoadedPhoto], tracks: Tracks, **_: object) -> list[DenseDepth]:
+        matched.extend(photos)
+        return matched_by_truth()(photos, tracks)
+
+    monkeypatch.setattr(depth_errors, "dense_depths", dense_depths)
+    model = run.model()
+    measure_depth_errors(run, model, depth_maps(model, run.cameras.train, max_size=48), threads=1)
+    used = {photo.frame.name: photo.used for photo in matched}
+    assert [name for name, pixels in used.items() if pixels is not None] == left_out
+    for name in left_out:
+        np.testing.assert_array_equal(used[name], kept)
 
 
 def test_tracks_of_a_surface_are_rays_to_its_points(spheres_run):

@@ -265,7 +265,7 @@ def test_splats_of_panoramas_are_refused_before_any_work(
     first, *others = nerfcli.load_run(run).cameras.train
     sphere = Camera("EQUIRECTANGULAR", 96, 48, (96.0, 48.0))
     write_cameras(run, [replace(first, camera=sphere), *others], [])
-    monkeypatch.setattr("nerfcli.workflows.splats.load_photos", lambda *given, **more: pytest.fail("work was done"))
+    monkeypatch.setattr("nerfcli.training.runs.run.load_photos", lambda *given, **more: pytest.fail("work was done"))
     with pytest.raises(UserError, match="360-degree photos, which splats cannot be fitted to") as refused:
         nerfcli.export_run(run, to="splats", splats=SMALL)
     assert refused.value.hint == "export it as a page, a mesh or points: --to page, mesh or points"

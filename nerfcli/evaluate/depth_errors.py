@@ -13,7 +13,6 @@ from nerfcli.cameras.rigid import apply
 from nerfcli.errors import UserError
 from nerfcli.matching.stereo import LONGER_SIDE_PX, dense_depths
 from nerfcli.matching.tracks import Tracks
-from nerfcli.photos.loading import load_photos
 from nerfcli.render.coverage import DepthMap, coverage_and_parallax, depth_maps, sees, small_frame
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.depth_errors import DepthErrors
@@ -45,8 +44,7 @@ def measure_depth_errors(
         )
     maps = [*photo_depths, *depth_maps(model, test)]
     tracks = surface_tracks(maps)
-    factor, masks = run.config.downscale, run.components.masks
-    photos = load_photos([*train, *test], factor=factor, threads=threads, masks=masks)
+    photos = run.photos([*train, *test])
     on_progress(0.1)
     measured = dense_depths(photos, tracks, longer_side_px=LONGER_SIDE_PX, threads=threads)
     parts = []

@@ -25,7 +25,7 @@ from nerfcli.field.exposure import changed_in_front, exposed
 from nerfcli.photos.colours import over_white, to_8_bit
 from nerfcli.photos.held_out_exposure import gain_sources, log_gains_of
 from nerfcli.photos.images import write_png
-from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photo, load_photos
+from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photo
 from nerfcli.render.pictures import Renderable, RenderedPicture
 from nerfcli.training.runs.run import Run
 
@@ -112,19 +112,11 @@ def held_out_photos(run: Run, frames: Sequence[Frame], *, left_out_by: Run | Non
     Raises:
         UserError: a photo cannot be read.
     """
-    threads, masks = torch.get_num_threads(), run.components.masks
-    photos = load_photos(frames, factor=run.config.downscale, threads=threads, masks=masks)
-    known = run.cameras.exposures
-    exposed = zip(photos, log_gains_of(frames, known).tolist(), gain_sources(frames, known), strict=True)
+    photos, known = (left_out_by or run).photos(frames), run.cameras.exposures
+    gains = zip(log_gains_of(frames, known).tolist(), gain_sources(frames, known), strict=True)
     return [
-        HeldOutPhoto(
-            photo.frame,
-            photo.pixels,
-            (left_out_by or run).used_pixels(photo),
-            log_gains=tuple(gains),
-            gains_from=source,
-        )
-        for photo, gains, source in exposed
+        HeldOutPhoto(photo.frame, photo.pixels, photo.used, tuple(log_gains), source)
+        for photo, (log_gains, source) in zip(photos, gains, strict=True)
     ]
 
 

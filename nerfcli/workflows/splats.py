@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.notices import Notify, Reporter, silent
-from nerfcli.photos.loading import LoadedPhoto, load_photos, pinhole_of
+from nerfcli.photos.loading import LoadedPhoto, pinhole_of
 from nerfcli.render.model import Model
 from nerfcli.splats.files import read_splats, write_splat_page, write_splats
 from nerfcli.splats.gaussians import rows_of
@@ -144,12 +144,7 @@ def run_splats(run: Run, model: Model, *, settings: SplatSettings, reporter: Rep
         return kept
     if model.device.type != "cpu":
         reporter.note("splats are refined on the CPU; the GPU renders the field that they start from")
-    loaded = _as_trained(
-        run,
-        load_photos(
-            run.cameras.train, factor=run.config.downscale, threads=torch.get_num_threads(), masks=run.components.masks
-        ),
-    )
+    loaded = _with_rays(run.photos(run.cameras.train))
     pictures = pictures_beside(
         model, loaded, on_progress=reporter.part(0.0, _PICTURES, f"pictures of the field, {_before(settings)}")
     )
@@ -208,15 +203,13 @@ def _kept(run: Run, model: Model, settings: SplatSettings) -> RunSplats | None:
     return splats if is_enough or settings.resume is not False else None
 
 
-def _as_trained(run: Run, loaded: Sequence[LoadedPhoto]) -> list[LoadedPhoto]:
-    """Return the photos without the pixels that the training left out: occluders, and those without a ray."""
+def _with_rays(loaded: Sequence[LoadedPhoto]) -> list[LoadedPhoto]:
+    """Return the photos without the pixels that have no ray, which the training left out."""
     has_ray = cache(lambda camera: camera.pixel_bearings()[1])
     photos = []
     for photo in loaded:
-        used, counting = has_ray(photo.frame.camera).reshape(photo.pixels.shape[:2]), run.used_pixels(photo)
-        if counting is not None:
-            used = used & counting
-        photos.append(replace(photo, used=None if used.all() else used))
+        without = ~has_ray(photo.frame.camera).reshape(photo.pixels.shape[:2])
+        photos.append(photo.without(without if without.any() else None))
     return photos
 
 

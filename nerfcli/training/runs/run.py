@@ -2,16 +2,17 @@
 
 import hashlib
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import torch
 
 from nerfcli.atomic import read_json, read_sealed, write_sealed
+from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.registry import photo_folder, recognised
 from nerfcli.captures.formats.run_cameras import CAMERAS, REPAIR_HINT, RunCameras, read_cameras, read_given_cameras
@@ -20,7 +21,7 @@ from nerfcli.captures.orientation import describe_rescaling
 from nerfcli.errors import UserError, in_shell
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.photos.images import read_image
-from nerfcli.photos.loading import LoadedPhoto
+from nerfcli.photos.loading import LoadedPhoto, load_photos
 from nerfcli.render.model import Model, load_model
 from nerfcli.training.runs.components import Components, Decision, Selection, differences
 from nerfcli.training.runs.files import (
@@ -259,16 +260,17 @@ class Run:
         """RUN/metrics.json."""
         return self.path / METRICS
 
-    def used_pixels(self, photo: LoadedPhoto) -> np.ndarray | None:
-        """Return which pixels (H, W) of a photo of the training's size count; None for all.
+    def photos(self, frames: Sequence[Frame]) -> list[LoadedPhoto]:
+        """Load photos as for the training; the pixels of their masks, and those that it has left out, are not used.
 
-        Not those of its mask, nor those that the training has left out of it.
+        Raises:
+            UserError: a photo cannot be read.
         """
-        left_out = left_out_mask(self.path, photo.frame.name)
-        if not left_out.exists():
-            return photo.used
-        kept = read_image(left_out)[..., 0] > 0
-        return kept if photo.used is None else kept & photo.used
+        factor, masks = self.config.downscale, self.components.masks
+        loaded = load_photos(frames, factor=factor, threads=torch.get_num_threads(), masks=masks)
+        files = [left_out_mask(self.path, frame.name) for frame in frames]
+        left_out = [read_image(file)[..., 0] == 0 if file.exists() else None for file in files]
+        return [photo.without(mask) for photo, mask in zip(loaded, left_out, strict=True)]
 
     def model(self, device: str = "cpu") -> Model:
         """Load the field with everything that rendering needs; each call loads it again.
