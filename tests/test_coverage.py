@@ -12,7 +12,6 @@ import tifffile
 import torch
 from commands import completed, error_of, nerfcli
 from fog import fog, foggy_cells
-from PIL import Image
 from present import present
 
 from nerfcli.cameras.camera import Camera
@@ -20,10 +19,11 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.captures.formats.run_cameras import RunCameras
 from nerfcli.notices import Reporter
+from nerfcli.photos.images import write_png
 from nerfcli.ply import read_ply_header
 from nerfcli.render.coverage import DepthMap, coverage_and_parallax, depth_maps, largest_angle_deg, sees, without_steep
 from nerfcli.render.files.file_facts import depth_meta_of
-from nerfcli.training.runs.files import PHOTO_DEPTHS
+from nerfcli.training.runs.files import PHOTO_DEPTHS, left_out_mask
 from nerfcli.training.runs.run import Run
 from nerfcli.workflows.photo_depths import photo_depths
 
@@ -271,18 +271,22 @@ def test_depths_of_photos_are_kept_for_the_field_they_belong_to(run, monkeypatch
     assert len(fractions) == 42
 
 
-def test_a_photo_sees_nothing_where_its_mask_covers_it(run, tmp_path):
+@pytest.mark.parametrize("by_training", [False, True], ids=["mask", "left out by the training"])
+def test_a_photo_sees_nothing_where_its_mask_covers_it(run, tmp_path, by_training):
     """A photo with a masked left half sees no points there; the other photos see as many as before."""
     trained, masked = Run(run), Run(run)
     train = list(trained.cameras.train)
     first = train[0]
     mask = np.full((first.camera.height, first.camera.width), 255, np.uint8)
     mask[:, : first.camera.width // 2] = 0
-    for name in ("photo.png", "mask.png"):
-        Image.fromarray(mask).save(tmp_path / name)
-    train[0] = replace(first, image=tmp_path / "photo.png", mask=tmp_path / "mask.png")
-    masked.__dict__["cameras"] = RunCameras(tuple(train), trained.cameras.test)
     whole, *others = photo_depths(trained, trained.model(), Reporter(pytest.fail))
+    if by_training:
+        write_png(left_out_mask(run, first.name), mask)
+    else:
+        for name in ("photo.png", "mask.png"):
+            write_png(tmp_path / name, mask)
+        train[0] = replace(first, image=tmp_path / "photo.png", mask=tmp_path / "mask.png")
+    masked.__dict__["cameras"] = RunCameras(tuple(train), trained.cameras.test)
     (run / PHOTO_DEPTHS).unlink()  # cached for the photos of the run, whose masks do not change
     part, *same = photo_depths(masked, masked.model(), Reporter(pytest.fail))
     half = whole.distances.shape[1] // 2

@@ -18,15 +18,16 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError, several
 from nerfcli.evaluate.depth_errors import measure_depth_errors
 from nerfcli.notices import Notify, Reporter
+from nerfcli.photos.images import read_image
 from nerfcli.photos.masks import read_mask
 from nerfcli.render.coverage import MAX_SIZE, STEEPEST_DEG, DepthMap, depth_maps, small_frame
 from nerfcli.render.depth_errors import LEAST_PHOTOS, LEAST_PIXELS, STRATA, DepthErrors
 from nerfcli.render.model import Model
-from nerfcli.training.runs.files import DEPTH_ERRORS, PHOTO_DEPTHS
+from nerfcli.training.runs.files import DEPTH_ERRORS, PHOTO_DEPTHS, left_out_mask
 from nerfcli.training.runs.run import Run
 from nerfcli.workflows.splats import file_digest
 
-FORMAT, ERRORS_FORMAT = "nerfcli photo depths 1", "nerfcli depth errors 1"
+FORMAT, ERRORS_FORMAT = "nerfcli photo depths 2", "nerfcli depth errors 1"
 # Fraction of held-out pixels that must be matched for reliable intervals. Measured: with 60 % matched, 89 % of the
 # depths are inside 90 % intervals; with 3.5 %, 69 %.
 LEAST_MATCHED = 0.2
@@ -48,11 +49,7 @@ def photo_depths(
         return kept
     on_progress = reporter.part(begin, end, "depths of the training photos")
     maps = depth_maps(model, frames, max_size=MAX_SIZE, on_progress=on_progress)
-    if run.components.masks == "ignore":
-        maps = [
-            view if frame.mask is None else _without_masked(view, frame, reporter.note)
-            for view, frame in zip(maps, frames, strict=True)
-        ]
+    maps = [_as_used(view, run, frame, reporter.note) for view, frame in zip(maps, frames, strict=True)]
     try:
         _write_photo_depths(run.path, maps, digest=expected)
     except UserError as error:  # runs in read-only folders can be rendered, too
@@ -86,18 +83,20 @@ def depth_errors(run: Run, model: Model, photos: Sequence[DepthMap], *, reporter
     return errors
 
 
-def _without_masked(view: DepthMap, frame: Frame, notify: Notify) -> DepthMap:
-    """Return the depth map with NaN where the mask excludes the photo's pixels."""
-    assert frame.mask is not None
-    assert frame.image is not None
-    try:
-        mask = read_mask(frame.mask, frame.image)
-    except UserError as error:  # the photos of a run may be gone
-        notify(f"the mask of {frame.name} is ignored: {error.message}")
-        return view
-    height, width = view.distances.shape
-    used = cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA) >= 128
-    return DepthMap(view.frame, np.where(used, view.distances, np.float32(np.nan)))
+def _as_used(view: DepthMap, run: Run, frame: Frame, notify: Notify) -> DepthMap:
+    """Return the depth map with NaN at the pixels of the photo that its mask excludes or the training has left out."""
+    left_out = left_out_mask(run.path, frame.name)
+    masks = [read_image(left_out)[..., 0]] if left_out.exists() else []
+    if frame.mask is not None and frame.image is not None and run.components.masks == "ignore":
+        try:
+            masks.append(read_mask(frame.mask, frame.image))
+        except UserError as error:  # the photos of a run may be gone
+            notify(f"the mask of {frame.name} is ignored: {error.message}")
+    distances = view.distances
+    for mask in masks:
+        used = cv2.resize(mask, distances.shape[::-1], interpolation=cv2.INTER_AREA) >= 128
+        distances = np.where(used, distances, np.float32(np.nan))
+    return DepthMap(view.frame, distances)
 
 
 def _digest(field_sha256: str | None, frames: Sequence[Frame]) -> str:
