@@ -2,6 +2,8 @@
 
 import hashlib
 import math
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,13 +17,15 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.evaluate.metrics import psnr, ssim, whole_windows
-from nerfcli.evaluate.photos import HeldOutPhoto
+from nerfcli.evaluate.photos import HeldOutPhoto, held_out_photos
 from nerfcli.evaluate.protocol import evaluate_model
 from nerfcli.field.exposure import exposed
 from nerfcli.photos.colours import over_white, to_8_bit
+from nerfcli.photos.images import write_png
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.training.checkpoints import HeldoutPixels
 from nerfcli.training.pool import PixelPool
+from nerfcli.training.runs.run import Run
 
 EVERYTHING = np.ones((24, 32), dtype=bool)
 # A grid without occupied cells: only the background is seen.
@@ -135,6 +139,18 @@ def test_evaluation_of_an_empty_model_is_the_distance_to_its_background():
     # White is saturated: photos on white give no colour correction.
     assert second.metrics.psnr_colour_aligned is None
     assert first.metrics.psnr_colour_aligned is not None
+
+
+def test_a_photo_with_alpha_does_not_put_others_on_white(finished: Path, tmp_path: Path):
+    """Regression: a transparent pixel in one held-out photo hid the learned sky behind all of them."""
+    run, frames = Run(finished), []
+    for name, alpha in (("a.png", 255), ("b.png", 254)):
+        view = run.cameras.test[0]
+        pixels = np.full((view.camera.height, view.camera.width, 4), 255, np.uint8)
+        pixels[:8, :8, 3] = alpha
+        write_png(tmp_path / name, pixels)
+        frames.append(replace(view, name=name, image=tmp_path / name))
+    assert [photo.pixels.shape[-1] for photo in held_out_photos(run, frames)] == [3, 4]
 
 
 def test_the_gains_of_a_photo_are_applied_to_its_picture():

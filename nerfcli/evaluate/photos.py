@@ -25,7 +25,7 @@ from nerfcli.field.exposure import changed_in_front, exposed
 from nerfcli.photos.colours import over_white, to_8_bit
 from nerfcli.photos.held_out_exposure import gain_sources, log_gains_of
 from nerfcli.photos.images import write_png
-from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photo
+from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, is_transparent, load_photo
 from nerfcli.render.pictures import Renderable, RenderedPicture
 from nerfcli.training.runs.run import Run
 
@@ -114,10 +114,12 @@ def held_out_photos(run: Run, frames: Sequence[Frame], *, left_out_by: Run | Non
     """
     photos, known = (left_out_by or run).photos(frames), run.cameras.exposures
     gains = zip(log_gains_of(frames, known).tolist(), gain_sources(frames, known), strict=True)
-    return [
-        HeldOutPhoto(photo.frame, photo.pixels, photo.used, tuple(log_gains), source)
-        for photo, (log_gains, source) in zip(photos, gains, strict=True)
-    ]
+    found = []
+    for photo, (log_gains, source) in zip(photos, gains, strict=True):
+        # Alpha that is opaque is dropped from each: a transparent pixel of one photo puts no other one on white.
+        pixels = photo.pixels if is_transparent(photo.pixels) else photo.pixels[..., :3]
+        found.append(HeldOutPhoto(photo.frame, pixels, photo.used, tuple(log_gains), source))
+    return found
 
 
 def training_billboards(run: Run, *, notify: Callable[[str], None]) -> Billboards | None:
