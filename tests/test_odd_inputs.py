@@ -863,7 +863,8 @@ def test_masks_of_photos_of_one_name_are_found_by_their_folders_on_disk(tmp_path
 
 def test_depth_maps_under_other_names_and_those_that_are_missing(tmp_path):
     content = written(tmp_path)
-    photos(tmp_path, ["depth/0.png", "depth/1.png", "depth/0 left.png", "depth/3.png", "depth/4.tif"])
+    names = ("0.png", "1.png", "0 left.png", "3.jpg", "3.png", "4.tif")  # 3.jpg is a preview
+    photos(tmp_path, [f"depth/{name}" for name in names])
     (tmp_path / "depth/2.npy").touch()
     named = ("C:\\x\\depth\\0.png", "depth\\1.PNG", "depth/2.npy", "depth/3", "depth/4.tiff", "depth/5.png", "", None)
     for frame, depth in zip(content["frames"], named, strict=False):

@@ -199,18 +199,17 @@ def _beside(
     for text, (_, where) in zip(texts, listed, strict=True):
         if not isinstance(text, str):
             raise malformed(where, f"{key} is {text!r:.80}", f"expected the path of a {noun} as text")
-    named = {text for text in texts if PurePosixPath(plain_name(text)).name}
-    found = find_photos(sorted(named), (places[0],), folders=(places[1],), others=())
-    files = [
-        find_mask(plain_name(name), places[0]) if noun == "mask" and (file is None or file in photos) else file
-        for name, file in zip(found.listed, found.paths, strict=True)
-    ]
-    paths = {
-        name: file
-        for name, file in zip(found.listed, files, strict=True)
-        if file is not None and file not in photos and (noun == "mask" or _may_be_depth(file, name))
-    }
-    lost = sorted(named - paths.keys())
+    named = sorted({text for text in texts if PurePosixPath(plain_name(text)).name})
+    # A depth map named without a suffix is the .png, not the preview as .jpg beside it.
+    looked_up = [text if noun == "mask" or Name.of(text).suffix else f"{text}.png" for text in named]
+    found = find_photos(looked_up, (places[0],), folders=(places[1],), others=()).paths
+    paths: dict[str, Path] = {}
+    for name, file in zip(named, found, strict=True):
+        if noun == "mask" and (file is None or file in photos):
+            file = find_mask(plain_name(name), places[0])
+        if file is not None and file not in photos and (noun == "mask" or _may_be_depth(file, name)):
+            paths[name] = file
+    lost = [name for name in named if name not in paths]
     notes = (f"{several(len(lost), noun)} named in {path.name} left out, not found: {in_words(lost)}",)
     return [paths.get(text) for text in texts], notes if lost else ()
 
