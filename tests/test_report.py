@@ -234,6 +234,7 @@ def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
     assert "differs: settings.log2_rows" in text
     assert "<th class=number>another</th>" in text
     assert text.index("differs: settings.log2_rows") < text.index(">settings.seed<")
+    assert "settings.field_memory_bytes" not in text  # what no run states
     assert "another: rendered" in text
     on_gpu = facts("on a GPU", config=replace(facts().config, settings=TrainSettings(device="cuda")))
     text = page_html([facts(), on_gpu], [look, look], depths=[_meta(), _meta()])

@@ -145,10 +145,10 @@ def selection_table(runs: Sequence[RunFacts]) -> Table:
 
 
 def settings_table(runs: Sequence[RunFacts]) -> Table:
-    """Format all settings and versions; rows in which runs differ are marked and come first."""
+    """Format the settings and versions that a run states; rows in which runs differ are marked and come first."""
     per_run = [_flat({"settings": run.config.settings.facts(), "versions": dict(run.config.versions)}) for run in runs]
     keys = list(dict.fromkeys(key for settings in per_run for key in settings))
-    rows = [(key, *(settings.get(key, "") for settings in per_run)) for key in keys]
+    rows = [(key, *(settings.get(key, "-") for settings in per_run)) for key in keys]
     differing = [row for row in rows if len(set(row[1:])) > 1]
     same = [row for row in rows if len(set(row[1:])) == 1]
     marked = [(f"differs: {row[0]}", *row[1:]) for row in differing]
@@ -161,8 +161,8 @@ def _flat(content: dict[str, Any], prefix: str = "") -> dict[str, str]:
         name = f"{prefix}{key}"
         if isinstance(value, dict):
             flat |= _flat(value, f"{name}.")
-        else:
-            flat[name] = "-" if value is None else str(value)
+        elif value is not None:
+            flat[name] = str(value)
     return flat
 
 
