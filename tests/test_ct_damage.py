@@ -276,6 +276,7 @@ def test_a_flat_with_the_object_in_the_beam_is_an_outlier(tmp_path: Path) -> Non
 def test_a_wrong_unit_is_mended(tmp_path: Path) -> None:
     """The file says 75 m, --unit says that its 75 are micrometres."""
     path = rewritten(nxtomo(tmp_path).path, "entry/instrument/detector/x_pixel_size", 75.0, units="m")
+    completed("ct", "doctor", path, "--unit", "um")
     completed("ct", "convert", path, tmp_path / "out", "--unit", "um")
     scan = load_scan(tmp_path / "out")
     assert scan.unit == "mm"

@@ -11,6 +11,7 @@ from nerfcli.ct import checks
 from nerfcli.ct.checks import Sample, sample_of
 from nerfcli.ct.describe import in_words
 from nerfcli.ct.formats.read import read_scan
+from nerfcli.ct.formats.statement import ScanOptions
 from nerfcli.ct.scan import Scan
 from nerfcli.notices import Progress, Reporter, no_progress
 from nerfcli.output import Output
@@ -75,13 +76,15 @@ def examine_scan(scan: Scan, *, progress: Progress = no_progress) -> ScanDiagnos
     return ScanDiagnosis(sample, tuple(findings), tuple(not_checked))
 
 
-def examine(source: Path, output: Output = Output(), *, reporter: Reporter = Reporter()) -> ScanDiagnosis:
+def examine(
+    source: Path, output: Output = Output(), *, given: ScanOptions = ScanOptions(), reporter: Reporter = Reporter()
+) -> ScanDiagnosis:
     """Run all checks of a scan in any format, and write a page of the findings, atomically.
 
     Raises:
         UserError: the scan cannot be read, or the page's path holds something else.
     """
-    scan = read_scan(source)
+    scan = read_scan(source, given)
     page = output.beside(source, "-doctor.html")
     pages.claim_page(output, page, pages.Mark("doctor", source), about="scan")
     reporter.note(f"{source}: {in_words(scan)}")

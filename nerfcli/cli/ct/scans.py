@@ -2,7 +2,7 @@
 
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -33,28 +33,20 @@ class ScanStatements:
     ] = None
     unit: Annotated[
         str | None,
-        typer.Option(help="Unit of lengths in IN, m, cm, mm, um or nm; overrides what IN states."),
+        typer.Option(help="Unit of lengths in the scan, m, cm, mm, um or nm; overrides what it states."),
     ] = None
     mirrored: Annotated[
-        bool, typer.Option("--mirrored", help="Columns are numbered from the other side than IN says.")
+        bool, typer.Option("--mirrored", help="Columns are numbered from the other side than stated.")
     ] = False
     centre_of_rotation: Annotated[
         float | None, typer.Option(help="The column of the axis of rotation; 0 is the middle of the first.")
     ] = None
-    holdout: Annotated[
-        str | None,
-        typer.Option(help="Views to hold out: every:6, block:0.15, or a file with numbers.", show_default=False),
-    ] = None
 
     def given(self) -> "ScanOptions":
-        """Return the statements.
-
-        Raises:
-            typer.BadParameter: the rule for held-out views cannot be parsed.
-        """
+        """Return the statements."""
         from nerfcli.ct.formats.statement import ScanOptions
 
-        return ScanOptions(self.photons, self.unit, self.centre_of_rotation, holdout_rule(self.holdout), self.mirrored)
+        return ScanOptions(self.photons, self.unit, self.centre_of_rotation, mirrored=self.mirrored)
 
 
 @command
@@ -67,6 +59,10 @@ def convert(
     ],
     *,
     stated: ScanStatements,
+    holdout: Annotated[
+        str | None,
+        typer.Option(help="Views to hold out: every:6, block:0.15, or a file with numbers.", show_default=False),
+    ] = None,
     overwrite: Overwrite = False,
     printing: Printing,
 ) -> None:
@@ -84,7 +80,7 @@ def convert(
       nerfcli ct convert tooth.h5 tooth --centre-of-rotation 295.8 --overwrite
       ls *.xtekct | nerfcli ct convert - scans/
     """
-    console, statements = printing.console, stated.given()
+    console, statements = printing.console, replace(stated.given(), holdout=holdout_rule(holdout))
 
     def work(given: Given) -> None:
         from nerfcli.ct.convert import convert_scan
@@ -100,6 +96,7 @@ def convert(
 def doctor(
     scan: Annotated[str, typer.Argument(help="Scan in any format, or - to read paths from standard input.")],
     *,
+    stated: ScanStatements,
     writing: Writing,
     require: Gate = None,
     printing: Printing,
@@ -113,18 +110,18 @@ def doctor(
 
     \b
     Examples:
-      nerfcli ct doctor tooth.h5
+      nerfcli ct doctor tooth.h5 --unit um
       nerfcli ct doctor tooth --require look
     """
     one_of(require, GATES, "--require")
-    console = printing.console
+    console, statements = printing.console, stated.given()
 
     def work(given: Given) -> None:
         from nerfcli.ct.examine import examine
 
         page = writing.beside(given, "-doctor.html")
         with console.stage(f"doctor {given.path.name}") as reporter:
-            diagnosis = examine(given.path, page, reporter=reporter)
+            diagnosis = examine(given.path, page, given=statements, reporter=reporter)
         show_findings(diagnosis, page.at(given.path), diagnosis.record, console)
         check_gate(diagnosis.findings, require)
 
