@@ -195,10 +195,17 @@ def test_masked_pixels_do_not_count():
     assert metrics.mean.ssim is None
 
 
-def test_a_mask_that_hides_a_whole_photo_is_reported():
-    hidden = HeldOutPhoto(frame("a.png"), noise(0, (12, 16, 3)), np.zeros((12, 16), dtype=bool))
-    with pytest.raises(UserError, match=r"no pixels of a\.png are left to compare"):
-        evaluate_model(fog(NOWHERE, Similarity.identity()), [hidden])
+def test_a_photo_that_its_mask_hides_is_left_out_and_named():
+    """Regression: the evaluation of a run failed because of a single black mask."""
+    model, pixels = fog(NOWHERE, Similarity.identity()), noise(0, (12, 16, 3))
+    seen = HeldOutPhoto(frame("a.png"), pixels, None)
+    hidden = HeldOutPhoto(frame("b.png"), pixels, np.zeros((12, 16), dtype=bool))
+    metrics = evaluate_model(model, [seen, hidden])
+    assert [image.name for image in metrics.images] == ["a.png"]
+    assert metrics.protocol.startswith("nerfcli-2: 1 held-out photos")
+    assert metrics.warnings == ("1 held-out photo hidden by masks and not compared: b.png",)
+    with pytest.raises(UserError, match="no pixels of the photos are left to compare"):
+        evaluate_model(model, [hidden])
 
 
 def test_protocol_says_what_was_measured():

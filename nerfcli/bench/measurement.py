@@ -26,7 +26,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.loading import refuse_without_held_out_photos
 from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import compare
-from nerfcli.evaluate.photos import HeldOutPhoto, background_of, held_out_photos, paired
+from nerfcli.evaluate.photos import HeldOutPhoto, background_of, held_out_photos, paired, without_hidden
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.machine import Resources
 from nerfcli.photos.images import downscale
@@ -208,7 +208,7 @@ def measure_renderings(run: Run, *, resources: Resources, seconds: float, save: 
     photos = held_out_photos(run, run.cameras.test)
     if not photos:
         raise UserError(f"{run.path} has no held-out photos", "train again with --holdout every:8 --overwrite")
-    settings = render_settings(resources.cores)
+    photos, settings = without_hidden(photos), render_settings(resources.cores)
     tell(0.0, "rendering a first picture")
     _render(model, photos[0], settings[0])
     once = _timed(model, photos[:1], settings[0])

@@ -43,6 +43,11 @@ class HeldOutPhoto(LoadedPhoto):
     log_gains: tuple[float, ...] = (0.0, 0.0, 0.0)
     gains_from: str = "none"
 
+    @property
+    def is_hidden(self) -> bool:
+        """Whether its mask leaves nothing of it to compare."""
+        return self.used is not None and not self.used.any()
+
 
 @dataclass(frozen=True)
 class ComparedImages:
@@ -59,6 +64,9 @@ class ComparedImages:
     on_white: bool
 
 
+_CHECK_MASKS = "check the masks: white pixels are used, black ones are ignored"
+
+
 def background_of(model: Renderable, photo: HeldOutPhoto) -> Background:
     """Return the background of pictures that are compared with a photo: white if the photo has alpha."""
     return (1.0, 1.0, 1.0) if photo.pixels.shape[-1] == 4 else model.background
@@ -68,14 +76,11 @@ def paired(photo: HeldOutPhoto, picture: RenderedPicture) -> ComparedImages:
     """Return a held-out photo with its rendered picture, to which the photo's gains are applied.
 
     Raises:
-        UserError: a mask hides the whole photo.
+        UserError: none of its pixels has a ray and is not masked.
     """
     used = picture.valid if photo.used is None else picture.valid & photo.used
     if not used.any():
-        raise UserError(
-            f"no pixels of {photo.frame.name} are left to compare",
-            "check its mask: white pixels are used, black ones are ignored",
-        )
+        raise UserError(f"no pixels of {photo.frame.name} are left to compare", _CHECK_MASKS)
     return ComparedImages(
         photo.frame,
         as_exposed(photo, picture.rgb, picture.opacity),
@@ -120,6 +125,18 @@ def held_out_photos(run: Run, frames: Sequence[Frame], *, left_out_by: Run | Non
         pixels = photo.pixels if is_transparent(photo.pixels) else photo.pixels[..., :3]
         found.append(HeldOutPhoto(photo.frame, pixels, photo.used, tuple(log_gains), source))
     return found
+
+
+def without_hidden(photos: Sequence[HeldOutPhoto]) -> list[HeldOutPhoto]:
+    """Return the photos that are not hidden.
+
+    Raises:
+        UserError: masks hide all photos.
+    """
+    seen = [photo for photo in photos if not photo.is_hidden]
+    if not seen:
+        raise UserError("no pixels of the photos are left to compare", _CHECK_MASKS)
+    return seen
 
 
 def training_billboards(run: Run, *, notify: Callable[[str], None]) -> Billboards | None:

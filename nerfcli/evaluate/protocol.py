@@ -16,11 +16,11 @@ import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import centres_of, focus_point, gaps_between
-from nerfcli.errors import UserError, listed
+from nerfcli.errors import UserError, listed, several
 from nerfcli.evaluate.billboards import Billboards, GeometryComparison, GeometryEvidence
 from nerfcli.evaluate.ledger import Entry
 from nerfcli.evaluate.metrics import LPIPS_NAME, Metrics, Perceptual, compare_fully, whole_windows
-from nerfcli.evaluate.photos import ComparedImages, HeldOutPhoto, background_of, paired
+from nerfcli.evaluate.photos import ComparedImages, HeldOutPhoto, background_of, paired, without_hidden
 from nerfcli.render.pictures import Renderable
 from nerfcli.training.runs.files import TrainingSummary
 
@@ -226,11 +226,12 @@ def evaluate_model(
     against `billboards`.
 
     Raises:
-        UserError: nothing was held out, or a mask hides a whole photo.
+        UserError: nothing was held out, or masks hide all photos.
     """
     if not held_out:
         hint = "train again with --holdout every:8 --overwrite"
         raise UserError("this run has no held-out photos to evaluate on", hint)
+    hidden, held_out = [photo.frame.name for photo in held_out if photo.is_hidden], without_hidden(held_out)
     total = sum(photo.pixels.shape[0] * photo.pixels.shape[1] for photo in held_out)
     done = 0
 
@@ -267,12 +268,18 @@ def evaluate_model(
             )
         )
     shape = evidence.shape() if evidence is not None else None
+    without = [f"{several(len(hidden), 'held-out photo')} hidden by masks and not compared: {listed(hidden)}"]
     return RunMetrics(
         _protocol_name(held_out, LPIPS_NAME + " (torchmetrics)" if perceptual is not None else "no LPIPS"),
         Metrics.mean([image.metrics for image in images]),
         tuple(images),
         shape,
-        (*_warnings(shape, evidence), *copy_warnings(views or ()), *outlier_warnings(images)),
+        (
+            *(without if hidden else ()),
+            *_warnings(shape, evidence),
+            *copy_warnings(views or ()),
+            *outlier_warnings(images),
+        ),
     )
 
 

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import compare
-from nerfcli.evaluate.photos import HeldOutPhoto, as_exposed, background_of
+from nerfcli.evaluate.photos import HeldOutPhoto, as_exposed, background_of, without_hidden
 from nerfcli.evaluate.protocol import PROTOCOL
 from nerfcli.field.background import colours_behind
 from nerfcli.photos.colours import over_white
@@ -38,12 +37,7 @@ class SampledPixels:
         Raises:
             UserError: masks hide all photos.
         """
-        photos = [photo for photo in photos if photo.used is None or photo.used.any()]
-        if not photos:
-            raise UserError(
-                "no pixels of the photos are left to compare",
-                "check their masks: white pixels are used, black ones are ignored",
-            )
+        photos = without_hidden(photos)
         generator = np.random.default_rng(seed)
         wanted = -(-SAMPLED_PIXELS // len(photos))
         chosen = []

@@ -71,8 +71,7 @@ def report_runs(
             hint = "run the command again when the training is complete"
             raise UserError(f"{run.field_path} was replaced while the report was written", hint)
         frames = [frame for frame in run.cameras.test if frame.name in names[index]]
-        held_out = held_out_photos(run, frames)
-        compared = [photo for photo in held_out if photo.used is None or photo.used.any()]
+        compared = [photo for photo in held_out_photos(run, frames) if not photo.is_hidden]
         photos = photo_depths(run, model, Reporter(reporter.note))
         looks.append(look_at(model, compared, depth=depth, photo_depths=photos, on_progress=on_progress))
         meanings.append(depth_meta(model, depth))
