@@ -45,7 +45,8 @@ def test_no_bit_depends_on_tiles_or_threads(trained, monkeypatch):
     for tile, threads in ((1, 2), (7, 1), (64, 2), (4095, 1)):
         torch.set_num_threads(threads)
         counts: list[int] = []
-        tiled = render_picture(model, frame, on_tile=counts.append, rays_per_tile=tile, **options)
+        monkeypatch.setattr(pictures, "RAYS_PER_TILE", tile)
+        tiled = render_picture(model, frame, on_tile=counts.append, **options)
         assert same_bits(tiled, whole) == []
         assert sum(counts) == 16 * 12
         assert len(counts) == -(-16 * 12 // tile)

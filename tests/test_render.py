@@ -16,7 +16,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts, look_at, rotation_from_quaternion
 from nerfcli.render.depth import CONVENTIONS
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import DepthRequest, RenderedPicture, default_rays_per_tile, render_picture
+from nerfcli.render.pictures import DepthRequest, RenderedPicture, rays_per_tile, render_picture
 
 # From a scene that is turned, moved and four times as large as the training frame.
 SIMILARITY = Similarity(0.25, rotation_from_quaternion(np.array([0.8, 0.2, -0.4, 0.4])), np.array([0.3, -0.2, 0.1]))
@@ -197,7 +197,7 @@ def test_tiles_of_a_gpu_fit_into_its_memory(gigabytes, rays, monkeypatch):
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda of: device)
     marching = SimpleNamespace(edges=lambda: torch.zeros(250))
     model = SimpleNamespace(device=torch.device("cuda:1"), marching=marching)
-    assert default_rays_per_tile(model) == pytest.approx(rays, rel=0.01)  # type: ignore[arg-type]
+    assert rays_per_tile(model) == pytest.approx(rays, rel=0.01)  # type: ignore[arg-type]
 
 
 def test_unknown_conventions_are_programming_errors():

@@ -28,12 +28,12 @@ class RenderedPicture:
     Args:
         rgb: (H, W, 3) sRGB in [0, 1], composited on the background; on black, it is premultiplied by the opacity.
         opacity: (H, W) in [0, 1].
+        truncation_error: (H, W) bound on the truncation error of each channel of rgb; the tolerance at most.
+        valid: (H, W) bool; False where the lens has no ray (rgb is then the background, opacity 0).
         depth: (H, W) as requested; None when not requested.
         spread: (H, W) standard deviation of where light ends, along the axis of depth; None without depth.
         disagreement: (H, W) |median - conditional| along that axis; None without depth.
         median: (H, W) distance along that axis at which half of all light is absorbed; None without depth.
-        truncation_error: (H, W) bound on the truncation error of each channel of rgb; the tolerance at most.
-        valid: (H, W) bool; False where the lens has no ray (rgb is then the background, opacity 0).
         coverage, parallax: (H, W) for the points at `median`, see `render.coverage`; None unless an export adds them.
         lower, upper: (H, W) bounds of an interval of depth, see `depth_errors`; None unless an export adds them.
         confidence: (H, W) fraction of depths within a tolerance, see `depth_errors`; None unless an export adds it.
@@ -41,12 +41,12 @@ class RenderedPicture:
 
     rgb: np.ndarray
     opacity: np.ndarray
-    depth: np.ndarray | None
-    spread: np.ndarray | None
-    disagreement: np.ndarray | None
-    median: np.ndarray | None
     truncation_error: np.ndarray
     valid: np.ndarray
+    depth: np.ndarray | None = None
+    spread: np.ndarray | None = None
+    disagreement: np.ndarray | None = None
+    median: np.ndarray | None = None
     coverage: np.ndarray | None = None
     parallax: np.ndarray | None = None
     lower: np.ndarray | None = None
@@ -62,26 +62,21 @@ def render_picture(
     background: Background,
     depth: DepthRequest | None = None,
     tolerance: float = TOLERANCE,
-    on_tile: Callable[[int], None] | None = None,
-    rays_per_tile: int | None = None,
+    on_tile: Callable[[int], None] = lambda rays: None,
 ) -> RenderedPicture:
     """Render one frame; the result is bit-identical for any tile size and number of threads.
 
     Args:
         tolerance: largest truncation error of a colour channel, in (0, 1]; see `tracing`.
-        rays_per_tile: number of rays rendered at a time, which only affects speed and memory; None for the default of
-            the device.
 
     Raises:
         UserError: the rendering has numbers that are not finite.
     """
-    if depth is not None and depth.convention == "background" and depth.background_distance is None:
-        raise ValueError("the background convention needs a background distance")
     if not 0.0 < tolerance <= 1.0:
         raise ValueError(f"need 0 < tolerance <= 1, got {tolerance}")
     width, height = frame.camera.width, frame.camera.height
     columns: list[tuple[Tensor, ...]] = []
-    tile = rays_per_tile or default_rays_per_tile(model)
+    tile = rays_per_tile(model)
     for first in range(0, width * height, RAYS_PER_BLOCK):
         chosen = range(first, min(first + RAYS_PER_BLOCK, width * height))
         rays = successive_rays(frame, model.training_from_scene, pixels=chosen, device=model.device)
@@ -89,18 +84,16 @@ def render_picture(
         for begin in range(0, len(chosen), tile):
             part = slice(begin, min(begin + tile, len(chosen)))
             columns.append(_render_tile(model, rays, part, background=behind, depth=depth, tolerance=tolerance))
-            if on_tile is not None:
-                on_tile(part.stop - part.start)
+            on_tile(part.stop - part.start)
     rgb, opacity, error, valid, *distances = (
         torch.cat(column).reshape(height, width, *column[0].shape[1:]).cpu().numpy()
         for column in zip(*columns, strict=True)
     )
     _refuse_non_finite(frame, {"rgb": rgb, "opacity": opacity, "truncation error": error})
-    depth_map, spread_map, disagreement_map, median_map = distances or (None,) * 4
-    return RenderedPicture(rgb, opacity, depth_map, spread_map, disagreement_map, median_map, error, valid)
+    return RenderedPicture(rgb, opacity, error, valid, *distances)
 
 
-def default_rays_per_tile(model: TrainedField) -> int:
+def rays_per_tile(model: TrainedField) -> int:
     """Return the number of rays rendered at a time on the device of a model."""
     if model.device.type != "cuda":
         return RAYS_PER_TILE
@@ -161,34 +154,21 @@ def _render_tile(
     )
     if depth is None:
         return colours
-    scale = model.training_from_scene.scale
-    maps = depth_maps_of(
-        depth,
-        seen.ends._replace(opacity=opacity),
-        cosines=rays.cosines[part],
-        unit=scale,
-        valid=valid,
-        background_distance=(depth.background_distance or 0.0) * scale,
-    )
-    return *colours, *maps
+    ends, scale = seen.ends._replace(opacity=opacity), model.training_from_scene.scale
+    return *colours, *depth_maps_of(depth, ends, cosines=rays.cosines[part], unit=scale, valid=valid)
 
 
 def depth_maps_of(
-    depth: DepthRequest,
-    ends: RayTermination,
-    *,
-    cosines: Tensor,
-    unit: float,
-    valid: Tensor,
-    background_distance: float,
+    depth: DepthRequest, ends: RayTermination, *, cosines: Tensor, unit: float, valid: Tensor
 ) -> tuple[Tensor, ...]:
     """Return the requested depth, spread, disagreement and median (R,), NaN where undefined.
 
     Args:
         ends: where the light of the rays ends, as distances along them.
         unit: length of a unit of the maps, in that of the distances.
-        background_distance: that of the request, in the unit of the distances.
     """
+    if depth.convention == "background" and depth.background_distance is None:
+        raise ValueError("the background convention needs a background distance")
     # There is no z behind the camera.
     factor, ahead = torch.full_like(cosines, 1.0 / unit), torch.ones_like(valid)
     if depth.axis == "z":
@@ -200,7 +180,7 @@ def depth_maps_of(
         peak=ends.peak * factor,
         quantiles=ends.quantiles * factor[:, None],
     )
-    distances = requested(depth, ends, background_distance=background_distance * factor)
+    distances = requested(depth, ends, background_distance=(depth.background_distance or 0.0) * unit * factor)
     maps = (distances, spread(depth, ends), disagreement(depth, ends), median(depth, ends))
     return tuple(torch.where(valid & ahead, values, torch.nan) for values in maps)
 
@@ -230,7 +210,7 @@ class Renderable(Protocol):
         *,
         background: Background,
         depth: DepthRequest | None = None,
-        on_tile: Callable[[int], None] | None = None,
+        on_tile: Callable[[int], None] = lambda rays: None,
     ) -> RenderedPicture:
         """Render a frame; see `render_picture`."""
 

@@ -1,7 +1,7 @@
 """Splats as a scene that can be rendered; cameras as the kernels of splats take them, any lens as a table."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -167,7 +167,7 @@ class SplatScene:
         *,
         background: Background | None = None,
         depth: DepthRequest | None = None,
-        on_tile: Callable[[int], None] | None = None,
+        on_tile: Callable[[int], None] = lambda rays: None,
     ) -> RenderedPicture:
         """Render a frame of the scene; the same bits for any number of threads.
 
@@ -176,33 +176,20 @@ class SplatScene:
         Args:
             background: sRGB, instead of that of the scene.
         """
-        if depth is not None and depth.convention == "background" and depth.background_distance is None:
-            raise ValueError("the background convention needs a background distance")
         behind = self.background if background is None or isinstance(background, SphereBackground) else background
         view = splat_view(frame, splats_from_scene=Similarity.identity(), near=self.near)
         seen = render_splats(self.rows, view, np.asarray(behind))
         valid, cosines = _rays_of(frame.camera)
         shape = seen.transmittance.shape
         error = np.where(seen.transmittance <= OPAQUE, seen.transmittance, 0.0).astype(np.float32)
-        picture = RenderedPicture(
-            np.clip(seen.image, 0.0, 1.0), 1.0 - seen.transmittance, None, None, None, None, error, valid.reshape(shape)
-        )
-        if on_tile is not None:
-            on_tile(valid.size)
+        on_tile(valid.size)
+        maps = []
         if depth is not None:
-            ends = splat_depths(seen, fractions(depth))
-            found = depth_maps_of(
-                depth,
-                ends,
-                cosines=torch.from_numpy(cosines),
-                unit=1.0,
-                valid=torch.from_numpy(valid),
-                background_distance=depth.background_distance or 0.0,
-            )
-            names = ("depth", "spread", "disagreement", "median")
-            maps = {name: values.numpy().reshape(shape) for name, values in zip(names, found, strict=True)}
-            picture = replace(picture, **maps)
-        return picture
+            along, there = torch.from_numpy(cosines), torch.from_numpy(valid)
+            found = depth_maps_of(depth, splat_depths(seen, fractions(depth)), cosines=along, unit=1.0, valid=there)
+            maps = [values.numpy().reshape(shape) for values in found]
+        rgb, opacity = np.clip(seen.image, 0.0, 1.0), 1.0 - seen.transmittance
+        return RenderedPicture(rgb, opacity, error, valid.reshape(shape), *maps)
 
 
 @lru_cache(maxsize=8)  # inverting a lens takes longer than rendering a picture
