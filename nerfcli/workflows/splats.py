@@ -13,7 +13,7 @@ import torch
 from nerfcli.cameras.frame import chosen_evenly
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import Similarity, look_at
-from nerfcli.errors import UserError, duration
+from nerfcli.errors import UserError, duration, in_shell
 from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.interrupts import deferred_interrupts
@@ -180,7 +180,7 @@ def run_splats(run: Run, model: Model, *, settings: SplatSettings, reporter: Rep
                 todo = "repeat the command" if settings.resume is None else "add --resume to the same command"
                 reporter.note(f"the splats are saved; to continue, {todo}")
         interrupts.raise_if_pending()
-    reporter.note(compared_in_words(model, loaded, splats))
+    reporter.note(_compared_in_words(run, model, loaded=loaded, splats=splats))
     return splats
 
 
@@ -245,14 +245,14 @@ def _before(settings: SplatSettings) -> str:
     return f"{duration(settings.budget_seconds)} of refinement left"
 
 
-def compared_in_words(model: Model, loaded: Sequence[LoadedPhoto], splats: RunSplats) -> str:
+def _compared_in_words(run: Run, model: Model, *, loaded: Sequence[LoadedPhoto], splats: RunSplats) -> str:
     """Compare field and splats on random pixels of training photos, and say how much longer to refine if needed."""
     photos = [
         HeldOutPhoto(photo.frame, photo.pixels, photo.used, tuple(gains.tolist()))
         for photo, gains in chosen_evenly(list(zip(loaded, splats.log_gains, strict=True)), COMPARED)
     ]
-    pixels = SampledPixels.drawn(photos, seed=0)
-    of_field, of_splats = pixels.psnr(model), pixels.psnr_of_pictures(scene_of(splats, model))
+    pixels, scene = SampledPixels.drawn(photos, seed=0), SplatScene(splats.gaussians(), splats.background)
+    of_field, of_splats = pixels.psnr(model), pixels.psnr_of_pictures(scene)
     seconds = splats.refinement.seconds
     words = (
         f"training photos: field {of_field:.1f} dB, splats {of_splats:.1f} dB after {splats.refinement.steps} steps in "
@@ -261,13 +261,9 @@ def compared_in_words(model: Model, loaded: Sequence[LoadedPhoto], splats: RunSp
     if of_splats < of_field - BELOW_DB:
         # On large captures the splats gain about 1 dB each time the seconds are doubled. A larger gap has other causes.
         longer = seconds * 2.0 ** min(of_field - of_splats, 3.0)
-        words += f"; the splats are below the field: go on with --resume --budget {longer:.0f}s"
+        more = f"nerfcli export {in_shell(run.path)} --to splats --resume --overwrite --budget {longer:.0f}s"
+        words += f"; the splats are below the field; to go on: {more}"
     return words
-
-
-def scene_of(splats: RunSplats, model: Model) -> SplatScene:
-    """Return the splats of a run as a scene that can be rendered."""
-    return SplatScene(splats.gaussians(), splats.background, model.unit, model.unit_source)
 
 
 def load_splats(path: str | Path, *, notify: Notify = silent) -> SplatScene:
