@@ -226,7 +226,7 @@ def test_what_is_no_time(text):
         ("export x --to mesh --voxel-size nan", "--voxel-size"),
         ("export x --to voxels", "'voxels'; choose page"),
         ("export x --to mesh --sh 0", "it is for splats"),
-        ("export x --to mesh -o a.stl", "not have the suffix of a mesh"),
+        ("export x --to mesh -o a.stl", "not have a suffix of --to mesh"),
         ("ct train x y", "(y); give one, or several on standard input: ls -d scans/*/ | nerfcli ct train -"),
         ("ct convert x", "Missing argument 'SCAN'"),
         ("export x --to mesh --format obj -o x.ply", "'obj' contradicts -o x.ply"),

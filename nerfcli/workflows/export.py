@@ -76,7 +76,7 @@ def export_run(
     path = output.at(default_target(trained.path, to))
     suffixes = TARGETS[to]
     if path.suffix.lower() not in suffixes:
-        raise UserError(f"{path} does not have the suffix of a {to}", f"use one of {', '.join(suffixes)}", exit_code=2)
+        raise UserError(f"{path} does not have a suffix of --to {to}", f"use one of {', '.join(suffixes)}", exit_code=2)
     _ = trained.config
     output.claim_file(path)
     resources.begin()
