@@ -22,9 +22,12 @@ from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.poses.engine import turntable
 from nerfcli.poses.engine.turntable import mask_turning_object, recall_masks
 from nerfcli.poses.input.job import CameraGroup, Job
+from nerfcli.training import preparation
 from nerfcli.training.loop import train
+from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.run import Run
 from nerfcli.training.runs.settings import TrainSettings
+from nerfcli.training.storage import MemoryNeeds, PhotoStorage, storage_for
 
 CAMERA = Camera.pinhole(320, 240, 300.0)
 STEPS = np.linspace(-1.0, 1.0, 9)
@@ -173,6 +176,18 @@ def test_training_and_evaluation_leave_it_out(capture, tmp_path, fixed):
     assert held_out.used is not None
     assert not held_out.used[GRIPPER].any()
     assert held_out.used[~grown(GRIPPER, 8)].all()
+
+
+def test_the_memory_of_its_masks_is_counted_where_it_is_found(capture, tmp_path, monkeypatch):
+    needs: list[MemoryNeeds] = []
+
+    def recorded(needed: MemoryNeeds, *limits: int | None, folder: Path) -> tuple[PhotoStorage, str]:
+        needs.append(needed)
+        return storage_for(needed, *limits, folder=folder)
+
+    monkeypatch.setattr(preparation, "storage_for", recorded)
+    prepare(capture, TrainSettings(budget_seconds=None, steps=20, model="auto"), run=tmp_path, notify=lambda note: None)
+    assert [entry.photos - needs[0].photos for entry in needs] == [0, 9 * 9 * 320 * 240]
 
 
 def job_of(work: Path, names: tuple[str, ...]) -> Job:

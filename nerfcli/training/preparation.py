@@ -33,7 +33,7 @@ from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.training.schedule import SEARCH_FRACTION, Budget
 from nerfcli.training.selection import Facts, select, with_evidence, with_known_cameras
 from nerfcli.training.step import NonFiniteError
-from nerfcli.training.storage import check_device_memory, needs_of, storage_for
+from nerfcli.training.storage import MASK_BYTES, check_device_memory, needs_of, storage_for
 from nerfcli.training.trials import Trials
 
 # Even a circular fisheye leaves a smaller fraction of a picture of 16:9 without rays.
@@ -85,6 +85,9 @@ def prepare(
     if attached:
         seen = tuple(photo.without(attached.get(photo.frame.name)) for photo in album.photos)
         photos = _photos(scene, replace(album, photos=seen), threads)
+        if all(frame.mask is None for frame in scene.frames):  # else masks are counted already
+            needs = replace(needs, photos=needs.photos + MASK_BYTES * sum(mask.size for mask in attached.values()))
+            storage, _ = storage_for(needs, memory_bytes, folder=run)
 
     if begun is not None:
         settings = replace(settings, components=begun.config.components)

@@ -43,6 +43,10 @@ class MemoryNeeds:
     rest: int
 
 
+# Of a mask and the list of the pixels that it leaves, for each pixel of the photos.
+MASK_BYTES = 9
+
+
 def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -> MemoryNeeds:
     """Estimate the memory of photos and field from their sizes; `rest` includes what is resident now."""
     sizes = [(frame.camera.width // factor) * (frame.camera.height // factor) for frame in frames]
@@ -53,11 +57,10 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
     )
     photos = (4 if may_have_alpha else 3) * sum(sizes) + 12 * sum(of_cameras.values())
     selects, components = settings.model == "auto", settings.components
-    # Masks of one byte, and the list of the pixels that they leave; occluders also have masks of the sky, and trials
-    # train on pixels that they are not scored on.
-    photos += (
-        9 * any(frame.mask is not None for frame in frames) + 10 * settings.may_have_occluders + 9 * selects
-    ) * sum(sizes)
+    # Occluders also have masks of the sky, and trials train on pixels that they are not scored on. What is attached to
+    # a camera is counted where it is found.
+    masks = any(frame.mask is not None for frame in frames) + settings.may_have_occluders + selects
+    photos += (MASK_BYTES * masks + settings.may_have_occluders) * sum(sizes)
     largest = max(frame.camera.width * frame.camera.height for frame in frames)
     # The field, its gradient and two moments, and the sentinel's copy of all of these except the gradient.
     field = planned_field(settings)
