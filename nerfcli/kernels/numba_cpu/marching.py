@@ -40,8 +40,8 @@ def _write(walk: Any, offsets: Any, starts: Any, ends: Any, coordinates: Any) ->
             look_ahead(walk, ray, first, places, cells)
             for i in range(min(CHUNK, intervals - first)):
                 if cells[i] >= 0 and walk.occupied[cells[i]]:
-                    starts[at] = cut(walk, ray, first + i)
-                    ends[at] = cut(walk, ray, first + i + 1)
+                    starts[at] = cut(walk.edges, walk.jitter[ray], first + i)
+                    ends[at] = cut(walk.edges, walk.jitter[ray], first + i + 1)
                     for axis in range(3):
                         coordinates[at, axis] = places[axis * CHUNK + i]
                     at += 1

@@ -1,124 +1,18 @@
 """Steps along rays and the cells that they cross: building blocks of `visible`; and `ray_indices`."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 import torch
-from llvmlite import ir
-from numba.core import types
-from numba.extending import intrinsic
 from torch import Tensor
 
 from nerfcli.kernels.contraction import CONTRACTIONS
 from nerfcli.kernels.interface import March, Rays
 from nerfcli.kernels.numba_cpu.threads import use_threads
-from nerfcli.kernels.numba_cpu.vector import (
-    FLOAT,
-    FLOATS,
-    INTS,
-    LANES,
-    LONG,
-    arguments_of,
-    floats,
-    in_all_lanes,
-    ints,
-    of_each,
-    vector_at,
-)
-
-_ONE_BIT = ir.VectorType(ir.IntType(1), LANES)
-
-
-def _larger(builder: Any, a: Any, b: Any) -> Any:
-    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
-
-
-def _smaller(builder: Any, a: Any, b: Any) -> Any:
-    return builder.select(builder.fcmp_ordered("<", a, b), a, b)
-
-
-def _unit_cube(builder: Any, points: list[Any]) -> list[Any]:
-    return [builder.fadd(builder.fmul(along, floats(0.5)), floats(0.5)) for along in points]
-
-
-def _ball(builder: Any, points: list[Any]) -> list[Any]:
-    x, y, z = (builder.fmul(along, along) for along in points)
-    square = builder.fadd(builder.fadd(x, y), z)
-    norm = of_each(builder, "llvm.sqrt", _larger(builder, square, floats(1.0)))
-    shrink = builder.fdiv(builder.fsub(floats(2.0), builder.fdiv(floats(1.0), norm)), norm)
-    scale = builder.fmul(shrink, floats(0.25))
-    return [builder.fadd(builder.fmul(along, scale), floats(0.5)) for along in points]
-
-
-def _cells(builder: Any, coordinates: list[Any], side: Any) -> Any:
-    """Return indices of cells in a grid, -1 outside; coordinates are clamped first, as distant ones would overflow."""
-    zero, one = floats(0.0), floats(1.0)
-    scale = in_all_lanes(builder, builder.sitofp(side, FLOAT), FLOATS)
-    line = in_all_lanes(builder, side, INTS)
-    last = builder.sub(line, ints(1))
-    inside, places = ir.Constant(_ONE_BIT, [1] * LANES), []
-    for along in coordinates:
-        within = _smaller(builder, _larger(builder, along, zero), one)
-        inside = builder.and_(inside, builder.fcmp_ordered("==", within, along))
-        place = builder.fptosi(builder.fmul(within, scale), INTS)
-        places.append(builder.select(builder.icmp_signed("<", place, last), place, last))
-    column, row, layer = places
-    cell = builder.add(builder.mul(builder.add(builder.mul(layer, line), row), line), column)
-    return builder.select(inside, cell, ints(-1))
-
-
-def _steps(cube_of: Callable[[Any, list[Any]], list[Any]]) -> Any:
-    """Return an intrinsic (origins, directions, ray, edges, shift, first, side, places, cells), on flat arrays.
-
-    Edge k of the ray is edges[k] + shift * (edges[k + 1] - edges[k]). It writes the coordinates of the midpoints of 16
-    intervals from number `first` on to places[axis * 16 + i], and their cells in a grid of `side` to cells[i].
-    """
-
-    @intrinsic
-    def steps(
-        typing_context: Any, origins: Any, directions: Any, ray: Any, edges: Any, shift: Any, first: Any, side: Any,
-        places: Any, cells: Any,
-    ) -> Any:  # fmt: skip
-        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            data, integer = arguments_of(context, builder, signature, args)
-            ray, first, side = integer(2), integer(5), integer(6, types.int32)
-            one, begin = ir.Constant(LONG, 1), builder.mul(ray, ir.Constant(LONG, 3))
-
-            def of_ray(which: int, axis: int) -> Any:
-                place = builder.gep(data(which), [builder.add(begin, ir.Constant(LONG, axis))])
-                return in_all_lanes(builder, builder.load(place), FLOATS)
-
-            near, middle, far = (
-                builder.load(vector_at(builder, data(3), first, one, count, FLOATS), align=4) for count in range(3)
-            )
-            jitter = in_all_lanes(builder, args[4], FLOATS)
-            start, end = (
-                builder.fadd(low, builder.fmul(jitter, builder.fsub(high, low)))
-                for low, high in ((near, middle), (middle, far))
-            )
-            t = builder.fmul(builder.fadd(start, end), floats(0.5))
-            points = [builder.fadd(of_ray(0, axis), builder.fmul(of_ray(1, axis), t)) for axis in range(3)]
-            coordinates = cube_of(builder, points)
-            zero = ir.Constant(LONG, 0)
-            for axis, along in enumerate(coordinates):
-                builder.store(along, vector_at(builder, data(7), zero, ir.Constant(LONG, LANES), axis, FLOATS), align=4)
-            builder.store(_cells(builder, coordinates, side), vector_at(builder, data(8), zero, one, 0, INTS), align=4)
-            return context.get_dummy_value()
-
-        return types.none(origins, directions, ray, edges, shift, first, side, places, cells), generate
-
-    return steps
-
-
-# See `_steps`; one for each of `CONTRACTIONS`.
-steps_in_cube = _steps(_unit_cube)
-steps_in_ball = _steps(_ball)
-
 
 # Steps of a ray that are processed together.
-CHUNK = LANES
+CHUNK = 16
 
 
 @numba.njit(inline="always")
@@ -174,9 +68,16 @@ def walk_of(rays: Rays, along: March, *, has_width: bool = False) -> Walk:
 
 
 @numba.njit(inline="always")
-def cut(walk: Any, ray: Any, k: Any) -> Any:
-    """Return the jittered edge number k of a ray."""
-    return walk.edges[k] + walk.jitter[ray] * (walk.edges[k + 1] - walk.edges[k])
+def cut(edges: Any, shift: Any, k: Any) -> Any:
+    """Return edge number k of a ray with the jitter `shift`."""
+    return edges[k] + shift * (edges[k + 1] - edges[k])
+
+
+@numba.njit(inline="always")
+def _cell(along: Any, side: Any) -> Any:
+    """Return the cell of a coordinate along one axis, and whether the coordinate is inside; NaN is not."""
+    within = min(max(np.float32(0), along), np.float32(1))  # distant ones would overflow
+    return min(np.int32(within * np.float32(side)), np.int32(side - 1)), within == along
 
 
 @numba.njit(inline="always")
@@ -185,10 +86,18 @@ def look_ahead(walk: Any, ray: Any, first: Any, places: Any, cells: Any) -> None
 
     The caller has to leave out steps beyond the last interval.
     """
-    if walk.contraction == 0:
-        steps_in_cube(walk.origins, walk.directions, ray, walk.edges, walk.jitter[ray], first, walk.side, places, cells)
-    else:
-        steps_in_ball(walk.origins, walk.directions, ray, walk.edges, walk.jitter[ray], first, walk.side, places, cells)
+    ox, oy, oz = walk.origins[ray, 0], walk.origins[ray, 1], walk.origins[ray, 2]
+    dx, dy, dz = walk.directions[ray, 0], walk.directions[ray, 1], walk.directions[ray, 2]
+    shift, side = walk.jitter[ray], np.int32(walk.side)
+    edges = walk.edges[first : first + CHUNK + 2]  # an index that may be negative would not be vectorised
+    for i in range(CHUNK):
+        t = (cut(edges, shift, i) + cut(edges, shift, i + 1)) * np.float32(0.5)
+        x, y, z = cube(ox + dx * t, oy + dy * t, oz + dz * t, walk.contraction)
+        places[i], places[CHUNK + i], places[2 * CHUNK + i] = x, y, z
+        (column, x_inside), (row, y_inside), (layer, z_inside) = _cell(x, side), _cell(y, side), _cell(z, side)
+        # Numba computes with 64 bits, and LLVM with 32 where it sees that no more are kept.
+        cell = np.int32(np.int32(np.int32(layer * side) + row) * side) + column
+        cells[i] = np.int32(cell) if x_inside & y_inside & z_inside else np.int32(-1)
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")

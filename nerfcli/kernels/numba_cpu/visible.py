@@ -115,8 +115,8 @@ def fill_round(walk: Any, space: Any, coming: Any, last_ray: Any, lanes: Any, lo
                 for i in range(past):
                     if cells[i] >= 0 and walk.occupied[cells[i]]:
                         samples.lane[filled] = lane
-                        samples.span[filled, 0] = cut(walk, ray, k + i)
-                        samples.span[filled, 1] = cut(walk, ray, k + i + 1)
+                        samples.span[filled, 0] = cut(walk.edges, walk.jitter[ray], k + i)
+                        samples.span[filled, 1] = cut(walk.edges, walk.jitter[ray], k + i + 1)
                         for axis in range(3):
                             samples.points[axis, filled] = places[axis * CHUNK + i]
                         if walk.cones.shape[0] > 0:
