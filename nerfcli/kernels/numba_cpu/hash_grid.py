@@ -6,119 +6,17 @@ cache. It is repeatable because a thread owns samples in the forward pass and wh
 threads ever write the same number.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 import torch
-from llvmlite import ir
-from numba.core import types
-from numba.extending import intrinsic
 from torch import Tensor
 
 from nerfcli.kernels.interface import FEATURES
 from nerfcli.kernels.numba_cpu.threads import use_threads
-from nerfcli.kernels.numba_cpu.vector import (
-    FLOAT,
-    FLOATS,
-    INT,
-    INTS,
-    LANES,
-    arguments_of,
-    dot_rows,
-    floats,
-    gather_rows,
-    in_all_lanes,
-    ints,
-    prefetch,
-    scatter_rows,
-    vector_at,
-)
+from nerfcli.kernels.numba_cpu.vector import dot_rows, gather_rows, prefetch, scatter_rows
 from nerfcli.kernels.reference.encoding import HASH_PRIMES
-
-
-def _cells(builder: Any, coordinates: Any, resolution: Any) -> tuple[list[Any], list[Any]]:
-    """Return cells and positions in them by axis; coordinates are clamped to [0, 1], NaN gives cell 0, position NaN."""
-    top = in_all_lanes(builder, builder.sitofp(resolution, FLOAT), FLOATS)
-    last = in_all_lanes(builder, builder.sub(resolution, ir.Constant(INT, 1)), INTS)
-    zero, one = floats(0.0), floats(1.0)
-    cells, inside = [], []
-    for along in coordinates:
-        along = builder.select(builder.fcmp_ordered("<", along, zero), zero, along)
-        along = builder.select(builder.fcmp_ordered(">", along, one), one, along)
-        scaled = builder.fmul(along, top)
-        whole = builder.fptosi(builder.select(builder.fcmp_unordered("uno", scaled, scaled), zero, scaled), INTS)
-        cell = builder.select(builder.icmp_signed("<", whole, last), whole, last)
-        cells.append(cell)
-        inside.append(builder.fsub(scaled, builder.sitofp(cell, FLOATS)))
-    return cells, inside
-
-
-def _hashed_rows(builder: Any, cells: Any, resolution: Any, rows: Any) -> list[Any]:
-    mask = in_all_lanes(builder, builder.sub(rows, ir.Constant(INT, 1)), INTS)
-    x = [cells[0], builder.add(cells[0], ints(1))]
-    y, z = (
-        [product := builder.mul(cell, ints(factor)), builder.add(product, ints(factor))]
-        for cell, factor in zip(cells[1:], HASH_PRIMES[1:], strict=True)
-    )
-    yz = [builder.xor(y[corner & 1], z[corner >> 1]) for corner in range(4)]
-    return [builder.and_(builder.xor(x[corner & 1], yz[corner >> 1]), mask) for corner in range(8)]
-
-
-def _dense_rows(builder: Any, cells: Any, resolution: Any, rows: Any) -> list[Any]:
-    side = builder.add(resolution, ir.Constant(INT, 1))
-    line, layer = (in_all_lanes(builder, step, INTS) for step in (side, builder.mul(side, side)))
-    first = builder.add(builder.mul(builder.add(builder.mul(cells[2], line), cells[1]), line), cells[0])
-    z = [first, builder.add(first, layer)]
-    yz = [z[corner >> 1] if corner & 1 == 0 else builder.add(z[corner >> 1], line) for corner in range(4)]
-    return [yz[corner >> 1] if corner & 1 == 0 else builder.add(yz[corner >> 1], ints(1)) for corner in range(8)]
-
-
-def _weights(builder: Any, inside: Any) -> list[Any]:
-    x, y, z = ([builder.fsub(floats(1.0), place), place] for place in inside)
-    xy = [builder.fmul(x[corner & 1], y[corner >> 1]) for corner in range(4)]
-    return [builder.fmul(xy[corner & 3], z[corner >> 2]) for corner in range(8)]
-
-
-def _corners(rows_of: Callable[..., list[Any]]) -> Any:
-    """Return an intrinsic (points, at, stride, resolution, rows, place, apart, index, weight, inside).
-
-    Reads the coordinates of 16 samples at points[at], points[at + stride], points[at + 2 stride]; writes the table row
-    and the weight of corner c to index[place + c apart] and weight[place + c apart] (bit 0 of c is x, bit 1 is y, bit 2
-    is z), and the positions inside the cells to inside[place + axis apart]. All arrays are flat, `index` of uint32.
-    """
-
-    @intrinsic
-    def corners(
-        typing_context: Any, points: Any, at: Any, stride: Any, resolution: Any, rows: Any, place: Any, apart: Any,
-        index: Any, weight: Any, inside: Any,
-    ) -> Any:  # fmt: skip
-        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            data, integer = arguments_of(context, builder, signature, args)
-            at, stride, place, apart = map(integer, (1, 2, 5, 6))
-            resolution, rows = (integer(i, types.int32) for i in (3, 4))
-            coordinates = [
-                builder.load(vector_at(builder, data(0), at, stride, axis, FLOATS), align=4) for axis in range(3)
-            ]
-            cells, within = _cells(builder, coordinates, resolution)
-            for which, kind, values in (
-                (7, INTS, rows_of(builder, cells, resolution, rows)),
-                (8, FLOATS, _weights(builder, within)),
-                (9, FLOATS, within),
-            ):
-                for count, value in enumerate(values):
-                    builder.store(value, vector_at(builder, data(which), place, apart, count, kind), align=4)
-            return context.get_dummy_value()
-
-        return types.none(points, at, stride, resolution, rows, place, apart, index, weight, inside), generate
-
-    return corners
-
-
-# See `_corners`; for levels with a separate row for each vertex, and for levels whose vertices share rows by a hash.
-dense_corners = _corners(_dense_rows)
-hashed_corners = _corners(_hashed_rows)
 
 
 class Table(NamedTuple):
@@ -140,6 +38,8 @@ def table_of(table: Tensor, resolutions: tuple[int, ...]) -> Table:
     return Table(table.view(-1).numpy(), table.shape[1], np.array(resolutions, dtype=np.int32))
 
 
+# Factors of the spatial hash.
+_OF_Y, _OF_Z = np.uint32(HASH_PRIMES[1]), np.uint32(HASH_PRIMES[2])
 # Samples in a block: in smaller blocks, a sample's row numbers would be read before the processor has stored them.
 BLOCK = 128
 
@@ -154,31 +54,87 @@ def _fade(widths: Any, first: Any, count: Any, resolution: Any, weight: Any) -> 
                 weight[corner * BLOCK + i] /= max(side * widths[first + i], one)
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _prepare_block(
-    points: Any, stride: Any, widths: Any, first: Any, count: Any, level: Any, table: Any, scratch: Any
-) -> None:
-    """Compute rows and weights of all corners of a block of samples, and prefetch the rows if they are hashed."""
-    inside, index, weight = scratch
-    resolution, rows = table.resolutions[level], table.rows
-    side = np.int64(resolution) + 1
-    if side * side * side <= rows:
-        for i in range(0, count, LANES):
-            dense_corners(points, first + i, stride, resolution, rows, i, BLOCK, index, weight, inside)
-    else:
-        for i in range(0, count, LANES):
-            hashed_corners(points, first + i, stride, resolution, rows, i, BLOCK, index, weight, inside)
-        offset = np.int64(level) * rows * FEATURES
+@numba.njit(inline="always")
+def _cells(points: Any, count: Any, resolution: Any, cells: Any, inside: Any) -> None:
+    """Write cells and positions in them along an axis; coordinates are clamped to [0, 1], NaN gives cell 0, NaN."""
+    zero, one, top, last = np.float32(0), np.float32(1), np.float32(resolution), np.int32(resolution - 1)
+    for i in range(count):
+        at = zero if points[i] < zero else points[i]
+        scaled = (one if at > one else at) * top
+        cell = min(np.int32(scaled if scaled == scaled else zero), last)
+        cells[i], inside[i] = np.uint32(cell), scaled - np.float32(cell)
+
+
+@numba.njit(inline="always")
+def _dense_rows(cells: Any, count: Any, resolution: Any, index: Any) -> None:
+    """Write the table rows of corners on a level with a separate row for each vertex."""
+    zero, line = np.uint32(0), np.uint32(resolution + 1)
+    layer = np.uint32(line * line)
+    for i in range(count):
+        row = np.uint32(np.uint32(cells[2 * BLOCK + i] * layer) + np.uint32(cells[BLOCK + i] * line)) + cells[i]
         for corner in range(8):
-            for i in range(count):
-                prefetch(table.flat, offset + np.int64(index[corner * BLOCK + i]) * FEATURES)
-    _fade(widths, first, count, resolution, weight)
+            beyond = np.uint32((line if corner & 2 else zero) + (layer if corner & 4 else zero))
+            index[corner * BLOCK + i] = np.uint32(row) + np.uint32(beyond + np.uint32(corner & 1))
+
+
+@numba.njit(inline="always")
+def _hashed_rows(cells: Any, count: Any, mask: Any, index: Any) -> None:
+    """Write the table rows of corners on a level whose vertices share rows by a hash."""
+    for i in range(count):
+        x, y, z = cells[i], np.uint32(cells[BLOCK + i] * _OF_Y), np.uint32(cells[2 * BLOCK + i] * _OF_Z)
+        for corner in range(8):
+            mixed = np.uint32(x + np.uint32(corner & 1))
+            mixed ^= np.uint32(y + _OF_Y) if corner & 2 else y
+            mixed ^= np.uint32(z + _OF_Z) if corner & 4 else z
+            index[corner * BLOCK + i] = mixed & mask
+
+
+@numba.njit(inline="always")
+def _weights(inside: Any, count: Any, weight: Any) -> None:
+    """Write the trilinear weights of corners."""
+    one = np.float32(1)
+    for i in range(count):
+        x, y, z = inside[i], inside[BLOCK + i], inside[2 * BLOCK + i]
+        for corner in range(8):
+            xy = (x if corner & 1 else one - x) * (y if corner & 2 else one - y)
+            weight[corner * BLOCK + i] = xy * (z if corner & 4 else one - z)
 
 
 @numba.njit(inline="always")
 def new_scratch() -> Any:
-    """Return room for the positions inside cells, rows and weights of a block."""
-    return np.empty(3 * BLOCK, np.float32), np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
+    """Return room for the cells of a block's samples, the positions inside them, and rows and weights of the corners.
+
+    Corner c of sample i has the row and the weight number c BLOCK + i; bit 0 of c is x, bit 1 is y, bit 2 is z.
+    """
+    cells, inside = np.empty(3 * BLOCK, np.uint32), np.empty(3 * BLOCK, np.float32)
+    return cells, inside, np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _prepare_block(
+    points: Any, stride: Any, widths: Any, first: Any, count: Any, level: Any, table: Any, scratch: Any
+) -> None:
+    """Compute rows and weights of all corners of a block of samples, and prefetch the rows if they are hashed.
+
+    The loops over samples are vectorised: the numbers that they write are at constant offsets of one array, and Numba's
+    integers of 64 bits are cut to 32 after each operation.
+    """
+    cells, inside, index, weight = scratch
+    resolution, rows = table.resolutions[level], table.rows
+    for axis in range(3):
+        begin, room = axis * stride + first, slice(axis * BLOCK, (axis + 1) * BLOCK)
+        _cells(points[begin : begin + count], count, resolution, cells[room], inside[room])
+    side = np.int64(resolution) + 1
+    if side * side * side <= rows:
+        _dense_rows(cells, count, resolution, index)
+    else:
+        _hashed_rows(cells, count, np.uint32(rows - 1), index)
+        offset = np.int64(level) * rows * FEATURES
+        for corner in range(8):
+            for i in range(count):
+                prefetch(table.flat, offset + np.int64(index[corner * BLOCK + i]) * FEATURES)
+    _weights(inside, count, weight)
+    _fade(widths, first, count, resolution, weight)
 
 
 @numba.njit(nogil=True, error_model="numpy")
@@ -189,7 +145,7 @@ def encode_range(
 
     The flat `points` are coordinates as from `by_axis`, with `stride` numbers per axis.
     """
-    index, weight = scratch[1], scratch[2]
+    index, weight = scratch[2], scratch[3]
     width = table.resolutions.shape[0] * FEATURES
     for level in range(table.resolutions.shape[0]):
         if table.resolutions[level] == 0:
@@ -206,11 +162,8 @@ def encode_range(
 
 
 def by_axis(points: Tensor) -> np.ndarray:
-    """Return coordinates (N, 3) as (3, M), M >= N a multiple of LANES, as corners are computed for whole vectors."""
-    count = len(points)
-    laid_out = points.new_zeros(3, -(-count // LANES) * LANES)
-    laid_out[:, :count] = points.t()
-    return laid_out.numpy()
+    """Return coordinates (N, 3) as (3, N)."""
+    return points.t().contiguous().numpy()
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
@@ -231,7 +184,7 @@ def _encode_backward(points: Any, widths: Any, gradient: Any, table: Any, thread
     samples = gradient.shape[0] // max(width, 1)
     for thread in numba.prange(threads):
         scratch = new_scratch()
-        index, weight = scratch[1], scratch[2]
+        index, weight = scratch[2], scratch[3]
         for level in range(thread, table.resolutions.shape[0], threads):
             if table.resolutions[level] == 0:
                 continue
@@ -278,7 +231,7 @@ def _points_backward(points: Any, widths: Any, table: Any, gradient: Any, out: A
         begin = thread * blocks // threads * BLOCK
         end = min((thread + 1) * blocks // threads * BLOCK, samples)
         scratch = new_scratch()
-        inside, index, dots = scratch
+        _, inside, index, dots = scratch
         for level in range(table.resolutions.shape[0]):
             resolution = table.resolutions[level]
             if resolution == 0:
