@@ -95,16 +95,14 @@ def composite(given: Inputs) -> Outcome:
 
 
 def optical_depth_before(given: Inputs) -> Outcome:
-    """Add optical depths in 60 digits; the gradient of their sum is the length times the intervals behind."""
+    """Add optical depths in 60 digits."""
     depths: list[float] = []
-    slopes: list[float] = []
     with localcontext() as context:
         context.prec = DIGITS
         for density, lengths in rays(given, "density", "lengths"):
             own = [Decimal(d) * Decimal(n) for d, n in zip(numbers(density), numbers(lengths), strict=True)]
             depths += map(float, itertools.accumulate(own[:-1], initial=Decimal(0)) if own else ())
-            slopes += [length * (len(own) - 1 - k) for k, length in enumerate(numbers(lengths))]
-    return Outcome({"before": tensor(depths)}, {"by density": tensor(slopes)})
+    return Outcome({"before": tensor(depths)})
 
 
 def distortion(given: Inputs) -> Outcome:

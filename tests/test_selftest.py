@@ -2,7 +2,6 @@
 
 import functools
 import json
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 from decimal import Decimal, getcontext
@@ -83,11 +82,10 @@ def test_hard_cases_have_their_exact_answers(check, precision):
 
 
 def depths_beyond_their_bounds(precision: Precision) -> set[str]:
-    """Return the depths that are farther from their 60-digit answers than permitted, or their gradients.
+    """Return the depths that are farther from their 60-digit answers than permitted.
 
-    The bound of a ray is b = u (16 + (n + 2) (1 + tau)), compiled 16 u; of a spread times 1 + the mean, from where most
-    light ends, over the spread; of a gradient by density 3 b relative to its terms: weights, their sum, and the sums of
-    the backward pass.
+    The bound of a ray is u (16 + (n + 2) (1 + tau)), compiled 16 u; of a spread times 1 + the mean, from where most
+    light ends, over the spread.
     """
     beyond = set()
     for given in cases.depth_rays():
@@ -102,15 +100,10 @@ def depths_beyond_their_bounds(precision: Precision) -> set[str]:
             fraction, own = textbook.QUANTILES.get(name), bound
             if fraction is not None and not exact_depths.is_settled(ray, fraction, within=bound):
                 continue  # it jumps over a gap
-            if name == "spread" and wanted.value > 0:
-                own *= 1 + abs(exact.depths["conditional"].value - exact.anchor) / wanted.value
-            error = largest_error(found.values[name], [wanted.value], tiny=precision.tiny)
-            slope = 0.0
-            if name in found.gradients and 3 * own <= MEANINGLESS:
-                slope = largest_error(found.gradients[name], wanted.gradient, tiny=precision.tiny, scale=wanted.size)
-            if not (error <= own and slope <= 3 * own):
+            if name == "spread" and wanted > 0:
+                own *= 1 + abs(exact.depths["conditional"] - exact.anchor) / wanted
+            if not largest_error(found[name], [wanted], tiny=precision.tiny) <= own:
                 beyond.add(name)
-        assert bool(found.gradients) == (not precision.compiled)
     return beyond
 
 
@@ -149,9 +142,6 @@ def test_the_command_is_within_its_bounds_and_says_why_they_are_what_they_are(ow
     compared = set(ANSWERS) - {"contract"}
     assert {(operation, name) for operation in compared for name in (SINGLE, "compiled")} <= tried
     assert {(operation, "bfloat16") for operation in ("composite", "ray_termination", "optical_depth_before")} <= tried
-    for row in own_rows:
-        if row.operation in ("ray_termination", "optical_depth_before") and not row.case.startswith("spread"):
-            assert (row.errors.gradient is None) == bool(row.no_gradient), row
 
 
 def test_every_textbook_formula_breaks_a_bound_somewhere(own_rows):
@@ -205,35 +195,19 @@ def test_textbook_formulas_are_caught(mistake, monkeypatch):
 
 
 def test_depths_by_textbook_formulas_are_caught(monkeypatch):
-    """The spread of a far, thin surface, and the gradient of its mean, were once the rounding of its distance."""
+    """The spread of a far, thin surface was once the rounding of its distance."""
     with monkeypatch.context() as patched:
         patched.setattr(depth, "mean_fraction", lambda x: torch.full_like(x, 0.5))
         assert "conditional" in depths_beyond_their_bounds(FLOAT)
     with monkeypatch.context() as patched:
         patched.setattr(depth, "max_weight", lambda weights, means, offsets: means.new_zeros(len(offsets) - 1))
-        assert {"conditional", "spread"} <= depths_beyond_their_bounds(FLOAT)
+        assert "spread" in depths_beyond_their_bounds(FLOAT)
 
 
 def test_a_broken_kernel_fails_the_command_too(monkeypatch):
     monkeypatch.setattr(numba_cpu, "composite", textbook.composite)
     rows = [row_of(check, COMPILED) for check in checks() if check.operation == "composite"]
     assert NOT_MET in {row.verdict for row in rows}
-
-
-def test_the_gradients_of_depths_are_difference_quotients_in_sixty_digits():
-    """Independent of the closed forms: (depth(density + h) - depth(density - h)) / 2 h, of the exact values."""
-    ray = Ray("slabs", [0.7, 1e-9, 2.5, 1.25], [1.0, 1.5, 2.0, 2.25], [1.5, 1.75, 2.25, 3.25])
-    answer, h = exact_depths.ray_termination(ray).depths, 2.0**-16
-    for k, sigma in enumerate(ray.density):
-        if sigma < h:
-            continue
-        moved = [[*ray.density[:k], sigma + step, *ray.density[k + 1 :]] for step in (h, -h)]
-        up, down = (exact_depths.ray_termination(replace(ray, density=density)) for density in moved)
-        for name, found in answer.items():
-            quotient = (up.depths[name].value - down.depths[name].value) / (2 * h)
-            defined = math.isfinite(found.value)  # what is undefined has no gradient
-            assert found.gradient[k] == pytest.approx(quotient if defined else 0.0, rel=1e-7, abs=1e-9), name
-            assert found.size[k] >= abs(found.gradient[k]) * (1 - 1e-12)
 
 
 def test_the_gradient_of_composited_rays_is_the_difference_quotient_in_sixty_digits():

@@ -68,10 +68,8 @@ def _pair(errors: "Errors | None") -> tuple[str, str]:
 
 
 def _cells(row: "Row") -> tuple[str, ...]:
-    error, gradient = _pair(row.errors)
-    gradient = "value only" if row.no_gradient else gradient
     milliseconds = "" if row.seconds is None else f"{1e3 * row.seconds:.1f}"
-    shown = (error, gradient, _number(row.bounds.value), row.verdict, *_pair(row.textbook), milliseconds)
+    shown = (*_pair(row.errors), _number(row.bounds.value), row.verdict, *_pair(row.textbook), milliseconds)
     return (row.case, row.operation, row.precision, *shown)
 
 

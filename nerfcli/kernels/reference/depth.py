@@ -2,7 +2,7 @@
 
 A ray has density sigma(t), transmittance T(t) and the density of absorption p(t) = T(t) sigma(t), whose integral is the
 opacity. Density is constant inside an interval, and everything here is exact for that: no midpoints. Packed samples as
-in `interface`; any dtype, differentiable. Only `ray_termination` has fast versions.
+in `interface`; any dtype, without gradients. Only `ray_termination` has fast versions.
 """
 
 import math
@@ -33,18 +33,12 @@ def mean_fraction(optical_depth: Tensor) -> Tensor:
 
     Returns:
         The same shape, in (0, 1/2]. Relative error of a few units of the dtype's precision everywhere.
-
-    Differentiable, also at 0 (where the slope is -1/12) and for large arguments.
     """
-    thin = optical_depth < SERIES_BELOW
-    x = torch.where(thin, optical_depth, 0.0)
-    x2 = x * x
+    x, x2 = optical_depth, optical_depth.square()
     # Bernoulli numbers: g(x) = 1/2 - sum B_2n x^(2n - 1) / (2n)!
     tail = 1 / 30240 - x2 * (1 / 1209600 - x2 / 47900160)
     series = 0.5 - x * (1 / 12 - x2 * (1 / 720 - x2 * tail))
-    y = torch.where(thin, 1.0, optical_depth)
-    closed = 1.0 / y + torch.exp(-y) / torch.expm1(-y)
-    return torch.where(thin, series, closed)
+    return torch.where(x < SERIES_BELOW, series, 1.0 / x + torch.exp(-x) / torch.expm1(-x))
 
 
 def variance_fraction(optical_depth: Tensor) -> Tensor:
@@ -54,48 +48,12 @@ def variance_fraction(optical_depth: Tensor) -> Tensor:
 
     Returns:
         The same shape, in (0, 1/12]. Relative error of about ten units of the dtype's precision everywhere.
-
-    Differentiable, also at 0 (where the slope is 0) and for large arguments.
     """
-    thin = optical_depth < VARIANCE_SERIES_BELOW
-    x = torch.where(thin, optical_depth, 0.0)
-    x2, series = x * x, torch.zeros_like(x)
+    x, x2, series = optical_depth, optical_depth.square(), torch.zeros_like(optical_depth)
     for coefficient in reversed(VARIANCE_SERIES):
         series = series * x2 + coefficient
-    y = torch.where(thin, 1.0, optical_depth)
-    inverse = 1.0 / y
-    closed = inverse * inverse - torch.exp(-y) / torch.expm1(-y).square()
-    return torch.where(thin, series, closed)
-
-
-def interval_means(density: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
-    """Return the mean distance (N,) of the light absorbed in each interval: t0 + 1/s - d / (exp(s d) - 1).
-
-    Differentiable in all arguments.
-    """
-    lengths = ends - starts
-    return starts + lengths * mean_fraction(density * lengths)
-
-
-def interval_variances(density: Tensor, lengths: Tensor) -> Tensor:
-    """Return the variance (N,) of the distance of the light absorbed in each interval. Differentiable."""
-    return lengths.square() * variance_fraction(density * lengths)
-
-
-def moment(weights: Tensor, means: Tensor, offsets: Tensor) -> Tensor:
-    """Return sum_i weight_i * mean_i, (R,). Differentiable; 0 for a ray without samples."""
-    return sum_along_rays(weights * means, offsets)
-
-
-def conditional(weights: Tensor, means: Tensor, offsets: Tensor) -> Tensor:
-    """Return `moment` / sum of the weights, (R,); NaN where no light is absorbed.
-
-    Differentiable where defined. It divides by the sum of the weights, not by the opacity, so that weights close to
-    underflow still give their mean.
-    """
-    total = sum_along_rays(weights, offsets)
-    defined = total > 0
-    return torch.where(defined, moment(weights, means, offsets) / torch.where(defined, total, 1.0), torch.nan)
+    closed = (1.0 / x).square() - torch.exp(-x) / torch.expm1(-x).square()
+    return torch.where(x < VARIANCE_SERIES_BELOW, series, closed)
 
 
 def mean_and_spread(
@@ -103,35 +61,32 @@ def mean_and_spread(
 ) -> tuple[Tensor, Tensor]:
     """Return mean and standard deviation (R,) of the distance of the absorbed light; NaN where none is absorbed.
 
-    mean = `conditional`,  variance = sum_i w_i (variance_i + (mean_i - mean)^2) / sum_i w_i: around the mean, so that
-    nothing cancels. For the spread and for the gradients of both, positions are relative to the mean position of the
-    heaviest interval: a distant, thin surface may be narrower than its distance's last digit, and move by less than
-    that with its density. Differentiable where they are defined and the spread is above 0.
+    mean = sum_i w_i mean_i / sum_i w_i,  variance = sum_i w_i (variance_i + (mean_i - mean)^2) / sum_i w_i
+
+    The variance is around the mean, so that nothing cancels, and for it positions are relative to the mean position of
+    the heaviest interval: a distant, thin surface may be narrower than its distance's last digit. Both are divided by
+    the sum of the weights, not by the opacity, so that weights close to underflow still give their mean.
     """
     total, lengths, rays = sum_along_rays(weights, offsets), ends - starts, ray_indices(offsets)
-    defined = total > 0
-    total = torch.where(defined, total, 1.0)
+    total = torch.where(total > 0, total, torch.nan)
     inside = lengths * mean_fraction(density * lengths)
-    first, further = (
-        torch.where(defined, max_weight(weights.detach(), x.detach(), offsets), 0.0)[rays] for x in (starts, inside)
-    )
+    first, further = (max_weight(weights, x, offsets)[rays] for x in (starts, inside))
     places = (starts - first) + (inside - further)
     middle = sum_along_rays(weights * places, offsets) / total
-    apart = interval_variances(density, lengths) + (places - middle[rays]).square()
-    variance = sum_along_rays(weights * apart, offsets) / total
-    wide = variance > 0
-    root = torch.where(wide, torch.where(wide, variance, 1.0).sqrt(), 0.0)
-    mean = conditional(weights, starts + inside, offsets).detach() + (middle - middle.detach())
-    return mean, torch.where(defined, root, torch.nan)
+    apart = lengths.square() * variance_fraction(density * lengths) + (places - middle[rays]).square()
+    spread = (sum_along_rays(weights * apart, offsets) / total).sqrt()
+    return sum_along_rays(weights * (starts + inside), offsets) / total, spread
 
 
 def max_weight(weights: Tensor, means: Tensor, offsets: Tensor) -> Tensor:
     """Return the mean of the interval with the largest weight, (R,), the nearest in a tie; NaN where none is absorbed.
 
-    The only result that depends on how the ray was cut into intervals. Differentiable in means.
+    The only result that depends on how the ray was cut into intervals.
     """
-    largest = _largest(weights.detach(), offsets)[ray_indices(offsets)]
-    return _nearest(torch.where((weights == largest) & (weights > 0), means, torch.inf), offsets)
+    rays, nothing = ray_indices(offsets), means.new_full((len(offsets) - 1,), torch.inf)
+    heaviest = (weights == _largest(weights, offsets)[rays]) & (weights > 0)
+    nearest = nothing.scatter_reduce(0, rays, torch.where(heaviest, means, torch.inf), "amin")
+    return torch.where(nearest.isinf(), torch.nan, nearest)
 
 
 def quantile(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, fraction: float) -> Tensor:
@@ -139,7 +94,7 @@ def quantile(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, 
 
     T(t) = 1 - fraction, so t = t0 + (-log(1 - fraction) - tau_before) / density in the interval where the optical depth
     passes -log(1 - fraction). The fraction, between 0 and 1, is one of all light, not of the absorbed light: NaN for a
-    ray of less opacity. Differentiable where defined; the value jumps where the crossing moves across empty space.
+    ray of less opacity.
     """
     target = -math.log1p(-fraction)
     lengths, rays = ends - starts, ray_indices(offsets)
@@ -153,17 +108,16 @@ def quantile(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, 
     found = first < len(density)
     crossed = first[found]
     inside = (target - before[crossed]) / torch.where(density > 0, density, 1.0)[crossed]
-    # Rounding may put the crossing outside a thin interval: the value is clamped, the gradient is the crossing's.
-    bounded = torch.minimum(inside, lengths[crossed])
-    places = starts[crossed] + inside + (bounded - inside).detach()
     result = torch.full((len(offsets) - 1,), torch.nan, dtype=density.dtype, device=density.device)
-    return result.masked_scatter(found, places)
+    # Rounding may put the crossing outside a thin interval.
+    return result.masked_scatter(found, starts[crossed] + torch.minimum(inside, lengths[crossed]))
 
 
+@torch.no_grad()
 def ray_termination(
     density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, fractions: tuple[float, ...]
 ) -> RayTermination:
-    """Compute all statistics of where the light of rays is absorbed.
+    """Compute all statistics of where the light of rays is absorbed, without gradients.
 
     Args:
         density: (N,) >= 0, finite; density * length from 0 to 1e6 and beyond.
@@ -176,27 +130,18 @@ def ray_termination(
         (R,); peak (R,): `max_weight`, and peak_weight (R,): that weight, 0 without samples; quantiles
         (R, len(fractions)). Undefined values are NaN, and no others.
 
-    Differentiable in density, starts and ends. Opacity and transmittance keep full precision where they are small.
+    Opacity and transmittance keep full precision where they are small.
     """
     lengths = ends - starts
     weights, transmittance = interval_weights(density, lengths, offsets)
-    means = interval_means(density, starts, ends)
     mean, width = mean_and_spread(weights, density, starts, ends, offsets=offsets)
     total = opacity(sum_along_rays(density * lengths, offsets))
     columns = [quantile(density, starts, ends, offsets=offsets, fraction=fraction) for fraction in fractions]
     quantiles = torch.stack(columns, dim=-1) if columns else density.new_empty(len(offsets) - 1, 0)
-    peak, largest = max_weight(weights, means, offsets), _largest(weights, offsets)
-    return RayTermination(total, transmittance, mean, width, peak, largest, quantiles)
+    peak = max_weight(weights, starts + lengths * mean_fraction(density * lengths), offsets)
+    return RayTermination(total, transmittance, mean, width, peak, _largest(weights, offsets), quantiles)
 
 
 def _largest(weights: Tensor, offsets: Tensor) -> Tensor:
     """Return the largest weight of each ray; 0 for a ray without samples."""
-    result = torch.zeros(len(offsets) - 1, dtype=weights.dtype, device=weights.device)
-    return result.scatter_reduce(0, ray_indices(offsets), weights, "amax")
-
-
-def _nearest(distances: Tensor, offsets: Tensor) -> Tensor:
-    """Return the smallest of each ray's distances; NaN where all are infinite."""
-    result = torch.full((len(offsets) - 1,), torch.inf, dtype=distances.dtype, device=distances.device)
-    result = result.scatter_reduce(0, ray_indices(offsets), distances, "amin")
-    return torch.where(result.isinf(), torch.nan, result)
+    return weights.new_zeros(len(offsets) - 1).scatter_reduce(0, ray_indices(offsets), weights, "amax")

@@ -78,7 +78,6 @@ class Row:
         formula: the textbook formula; "" if there is none.
         textbook: its errors on the same inputs; None also for compiled kernels, as plain float32 has its own row.
         seconds: time of one run of the operation, forward and backward.
-        no_gradient: reason why this implementation has no gradient; "" if it has one, or none is needed.
     """
 
     case: str
@@ -90,7 +89,6 @@ class Row:
     formula: str = ""
     textbook: Errors | None = None
     seconds: float | None = None
-    no_gradient: str = ""
 
     @property
     def verdict(self) -> str:

@@ -145,9 +145,9 @@ def composite(module: ModuleType, given: Inputs) -> Outcome:
 
 def before(module: ModuleType, given: Inputs) -> Outcome:
     """Compute the optical depths in front of intervals."""
-    density = _density_for(module, given)
-    before = module.optical_depth_before(density, given["lengths"], offsets=given["offsets"])
-    return Outcome({"before": before.detach()}, _by(before, density, "by density"))
+    return Outcome(
+        {"before": module.optical_depth_before(given["density"], given["lengths"], offsets=given["offsets"])}
+    )
 
 
 def distortion(module: ModuleType, given: Inputs) -> Outcome:
@@ -157,19 +157,6 @@ def distortion(module: ModuleType, given: Inputs) -> Outcome:
     value = module.distortion(weights, given["starts"], given["ends"], offsets)
     (gradient,) = torch.autograd.grad(value.sum(), weights)
     return Outcome({"distortion": value.detach().reshape(1)}, {"by weights": gradient})
-
-
-def _by(values: Tensor, density: Tensor, name: str) -> Inputs:
-    """Return the gradient of the sum of the defined values by density; empty if the operation has none."""
-    if not values.requires_grad:
-        return {}
-    total = torch.where(values.isnan(), 0.0, values).sum()
-    return {name: torch.autograd.grad(total, density, retain_graph=True)[0]}
-
-
-def _density_for(module: ModuleType, given: Inputs) -> Tensor:
-    """Return the densities of rays, which need a gradient except in compiled operations, which have none."""
-    return given["density"].detach().requires_grad_(module in (reference, textbook))
 
 
 def optical_depth(ray: Ray) -> float:
@@ -204,42 +191,29 @@ def depth_bound(rays: Sequence[Ray], factor: float, precision: Precision) -> Err
     lengths = (tuple(end - start for start, end in zip(ray.starts, ray.ends, strict=True)) for ray in rays)
     intervals = [Segments(tuple(ray.density), length) for ray, length in zip(rays, lengths, strict=True)]
     samples, depth = deepest_ray(intervals, precision)
-    bound = factor * precision.unit * (16 + (samples + 2) * (1 + depth))
-    return Errors(bound, 16 * bound)
+    return Errors(factor * precision.unit * (16 + (samples + 2) * (1 + depth)))
 
 
-def depths(module: ModuleType, given: Inputs) -> Outcome:
-    """Compute all depths of rays, and the gradients of their sums without what is undefined."""
-    density = _density_for(module, given)
+def depths(module: ModuleType, given: Inputs) -> Inputs:
+    """Compute all depths of rays."""
+    spans, offsets = (given["density"], given["starts"], given["ends"]), given["offsets"]
     if module is textbook:
-        named = textbook.depth(density, given["starts"], given["ends"], offsets=given["offsets"])
+        named = textbook.depth(*spans, offsets=offsets)
     else:
-        seen = module.ray_termination(
-            density, given["starts"], given["ends"], offsets=given["offsets"], fractions=FRACTIONS
-        )
+        seen = module.ray_termination(*spans, offsets=offsets, fractions=FRACTIONS)
         named = {"opacity": seen.opacity, "transmittance": seen.transmittance, "spread": seen.spread}
         named |= {"conditional": seen.mean, "max-weight": seen.peak}
         named |= dict(zip(QUANTILES, seen.quantiles.unbind(1), strict=True))
     if "settled" in given:
-        settled = dict(zip(QUANTILES, given["settled"].to(density.device).unbind(1), strict=True))
+        settled = dict(zip(QUANTILES, given["settled"].to(offsets.device).unbind(1), strict=True))
         named |= {name: torch.where(settled[name], named[name], 0.0) for name in QUANTILES}
-    gradients: Inputs = {}
-    for name, values in named.items():
-        gradients |= _by(values, density, name)
-    return Outcome({name: values.detach() for name, values in named.items()}, gradients)
+    return named
 
 
 def ray_termination(columns: tuple[str, ...], module: ModuleType, given: Inputs) -> Outcome:
-    """Compute the depths of rays that `columns` names; errors of gradients are relative to the largest of each ray."""
+    """Compute the depths of rays that `columns` names."""
     every = depths(module, given)
-    # Errors of the gradient of a spread are relative to terms that cancel, whose magnitudes only the tests know.
-    gradients = {name: every.gradients[name] for name in columns if name in every.gradients and name != "spread"}
-    counts = given["offsets"].diff().tolist()
-    sizes = {
-        name: torch.cat([part.abs().max().expand_as(part) for part in gradient.split(counts) if len(part)])
-        for name, gradient in gradients.items()
-    }
-    return Outcome({name: every.values[name] for name in columns}, gradients, sizes)
+    return Outcome({name: every[name] for name in columns})
 
 
 def grid_inputs(points: Sequence[cases.Point], grids: tuple[int, ...], rounded: int, precision: Precision) -> Inputs:

@@ -19,7 +19,6 @@ OPERATIONS_OF_GPU = (
     *("composite", "optical_depth_before", "distortion", "ray_termination"),
     *("hash_encode", "pixel_rays", "adam_rows", "visible_samples"),
 )
-VALUE_ONLY = "value only: where a gradient is wanted, plain torch gives both"
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,6 @@ class Check:
         inputs: returns the inputs, rounded to a precision, on which `run` and, by its `formula`, `textbook` operate.
         bound: returns the bounds of values and gradients in a precision, which `reason` derives.
         precisions: names of the precisions to test.
-        no_gradient: reason why the compiled operation has no gradient.
     """
 
     case: str
@@ -42,7 +40,6 @@ class Check:
     precisions: tuple[str, ...] = (SINGLE, HALF, COMPILED)
     formula: str = ""
     textbook: Callable[[operations.Inputs], operations.Outcome] | None = None
-    no_gradient: str = ""
 
     def is_for(self, precision: Precision) -> bool:
         """Return True if the case is tested in a precision and has correct digits there."""
@@ -72,7 +69,6 @@ def row_of(check: Check, precision: Precision) -> Row:
         formula=check.formula,
         textbook=plain,
         seconds=seconds,
-        no_gradient="" if precision.parts is reference else check.no_gradient,
     )
 
 
@@ -108,13 +104,12 @@ def light_checks() -> Iterator[Check]:
         "optical_depth_before",
         lambda precision: operations.intervals(cases.thick_and_thin(precision), precision),
         operations.before,
-        lambda precision: operations.both(
-            2 if precision.compiled else 17 if precision.name == HALF else 4097, precision
+        lambda precision: Errors(
+            (2 if precision.compiled else 17 if precision.name == HALF else 4097) * precision.unit
         ),
         "(n + 1) u: sums of n terms that are all positive, 16 in bfloat16; compiled 2 u: sums in float64",
         formula="cumulative sum less the own part",
         textbook=partial(operations.before, textbook),
-        no_gradient=VALUE_ONLY,
     )
     yield Check(
         "distortion of a far, thin surface",
@@ -148,11 +143,9 @@ def depth_check(case: str, columns: tuple[str, ...], rays: list[cases.Ray]) -> C
         lambda precision: operations.depth_inputs(operations.meaningful(rays, precision), precision),
         partial(operations.ray_termination, columns),
         lambda precision: operations.depth_bound(operations.meaningful(rays, precision), factor, precision),
-        "u (16 + (n + 2) (1 + tau)), compiled 16 u; of a spread 4 times that; 16 times for a gradient, "
-        "relative to the largest of its ray",
+        "u (16 + (n + 2) (1 + tau)), compiled 16 u; of a spread 4 times that",
         formula="weights by 1 - exp at midpoints, their sum clamped at 1e-10",
         textbook=partial(operations.ray_termination, columns, textbook),
-        no_gradient=VALUE_ONLY,
     )
 
 
