@@ -12,7 +12,7 @@ from typing import NamedTuple
 from exact_answers import DIGITS
 
 from nerfcli.kernels.selftest.cases import Ray
-from nerfcli.kernels.selftest.textbook import QUANTILES
+from nerfcli.kernels.selftest.operations import QUANTILES
 
 # Optical depth below which sixty digits are too few for the closed forms of mean and variance.
 _THIN = Decimal("1e-15")

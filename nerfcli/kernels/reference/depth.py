@@ -16,7 +16,7 @@ from nerfcli.kernels.reference.compositing import interval_weights, optical_dept
 
 # Below this optical depth the mean position is taken from its series, whose next term is then at most 5e-14.
 SERIES_BELOW = 0.25
-# The same for the variance, whose closed form loses 12 / x^2 units of precision; next term 9e-20, 3e-16 in the slope.
+# The same for the variance, whose closed form loses 12 / x^2 units of precision; next term 9e-20.
 VARIANCE_SERIES_BELOW = 1.0
 # (2n - 1) B_2n / (2n)! with the Bernoulli numbers B, for n = 1, 2, ...
 VARIANCE_SERIES = (
@@ -110,7 +110,8 @@ def quantile(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, 
     inside = (target - before[crossed]) / torch.where(density > 0, density, 1.0)[crossed]
     result = torch.full((len(offsets) - 1,), torch.nan, dtype=density.dtype, device=density.device)
     # Rounding may put the crossing outside a thin interval.
-    return result.masked_scatter(found, starts[crossed] + torch.minimum(inside, lengths[crossed]))
+    result[found] = starts[crossed] + torch.minimum(inside, lengths[crossed])
+    return result
 
 
 @torch.no_grad()

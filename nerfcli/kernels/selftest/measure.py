@@ -1,7 +1,6 @@
 """Rows of the selftest, and the definition of errors and precisions."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from types import ModuleType
 from typing import Any
@@ -75,8 +74,6 @@ class Row:
         errors: errors of nerfcli.
         bounds: largest permitted errors.
         reason: derivation of the bounds.
-        formula: the textbook formula; "" if there is none.
-        textbook: its errors on the same inputs; None also for compiled kernels, as plain float32 has its own row.
         seconds: time of one run of the operation, forward and backward.
     """
 
@@ -86,9 +83,7 @@ class Row:
     errors: Errors
     bounds: Errors
     reason: str
-    formula: str = ""
-    textbook: Errors | None = None
-    seconds: float | None = None
+    seconds: float
 
     @property
     def verdict(self) -> str:
@@ -100,11 +95,6 @@ class Row:
         pairs = ((errors.value, self.bounds.value), (errors.gradient, self.bounds.gradient))
         return all(error <= bound for error, bound in pairs if error is not None and bound is not None)
 
-    @property
-    def textbook_fails(self) -> bool:
-        """True if the textbook formula exceeds the bounds of this row."""
-        return self.textbook is not None and not self.holds(self.textbook)
-
     def to_json(self) -> dict[str, Any]:
         """Return plain values; non-finite numbers as strings, since JSON cannot hold them."""
 
@@ -114,24 +104,6 @@ class Row:
             return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
         return {**plain(asdict(self)), "verdict": self.verdict}
-
-
-def by_formula(rows: Sequence[Row]) -> list[Row]:
-    """Return one row per textbook formula: the one farthest beyond its bounds, in float32 if there are such rows."""
-    formulas: dict[str, list[Row]] = {}
-    for row in rows:
-        if row.textbook is not None:
-            formulas.setdefault(row.formula, []).append(row)
-    single = ([row for row in own if row.precision == "float32"] or own for own in formulas.values())
-    return [max(own, key=_beyond) for own in single]
-
-
-def _beyond(row: Row) -> float:
-    """Return the largest ratio of the textbook's errors to the bounds."""
-    assert row.textbook is not None
-    pairs = ((row.textbook.value, row.bounds.value), (row.textbook.gradient, row.bounds.gradient))
-    bounded = [(error, bound) for error, bound in pairs if error is not None and bound is not None]
-    return max(error / bound if bound else math.inf * error if error else 0.0 for error, bound in bounded)
 
 
 def largest_error(values: Any, wanted: Any, *, tiny: float, scale: Any = None) -> float:

@@ -15,13 +15,13 @@ from torch import Tensor
 
 from nerfcli.kernels import AdamStep, HashGrid, March, PixelTable, Rays, reference
 from nerfcli.kernels.activations import density_from_log
-from nerfcli.kernels.selftest import cases, textbook
+from nerfcli.kernels.selftest import cases
 from nerfcli.kernels.selftest.cases import MEANINGLESS, Ray, Segments, deepest_ray
 from nerfcli.kernels.selftest.measure import Errors, Precision, largest_error
 
 BACKGROUND = COLOUR_GRADIENT = (1.0, 0.5, 0.25)
 TRANSMITTANCE_GRADIENT = 0.5
-QUANTILES, FRACTIONS = tuple(textbook.QUANTILES), tuple(textbook.QUANTILES.values())
+QUANTILES = {"median": 0.5, "0.05": 0.05, "0.95": 0.95}
 RATE, BETAS, EPS = 0.01, (0.9, 0.99), 1e-15
 # From this pixel number on, float32 cannot distinguish neighbouring numbers.
 MANY = 2**24
@@ -170,7 +170,7 @@ def depth_inputs(rays: Sequence[Ray], precision: Precision) -> Inputs:
     density, starts, ends = (precision.tensor([x for values in column for x in values]) for column in columns)
     offsets = _offsets([len(ray.density) for ray in rays], precision)
     off = min(0.5, depth_bound(rays, 1, precision).value)
-    near = [1 - (1 - fraction) ** (1 + x) for x in (-off, off) for fraction in FRACTIONS]
+    near = [1 - (1 - fraction) ** (1 + x) for x in (-off, off) for fraction in QUANTILES.values()]
     spans = map(exact, (density, starts, ends))
     low, high = reference.ray_termination(*spans, offsets=offsets.cpu(), fractions=tuple(near)).quantiles.split(
         3, dim=1
@@ -197,13 +197,10 @@ def depth_bound(rays: Sequence[Ray], factor: float, precision: Precision) -> Err
 def depths(module: ModuleType, given: Inputs) -> Inputs:
     """Compute all depths of rays."""
     spans, offsets = (given["density"], given["starts"], given["ends"]), given["offsets"]
-    if module is textbook:
-        named = textbook.depth(*spans, offsets=offsets)
-    else:
-        seen = module.ray_termination(*spans, offsets=offsets, fractions=FRACTIONS)
-        named = {"opacity": seen.opacity, "transmittance": seen.transmittance, "spread": seen.spread}
-        named |= {"conditional": seen.mean, "max-weight": seen.peak}
-        named |= dict(zip(QUANTILES, seen.quantiles.unbind(1), strict=True))
+    seen = module.ray_termination(*spans, offsets=offsets, fractions=tuple(QUANTILES.values()))
+    named = {"opacity": seen.opacity, "transmittance": seen.transmittance, "spread": seen.spread}
+    named |= {"conditional": seen.mean, "max-weight": seen.peak}
+    named |= dict(zip(QUANTILES, seen.quantiles.unbind(1), strict=True))
     if "settled" in given:
         settled = dict(zip(QUANTILES, given["settled"].to(offsets.device).unbind(1), strict=True))
         named |= {name: torch.where(settled[name], named[name], 0.0) for name in QUANTILES}
@@ -242,11 +239,6 @@ def encode(module: ModuleType, given: Inputs) -> Outcome:
         {"by table": largest},
         {"encoded": sizes.expand_as(encoded)},
     )
-
-
-def encode_in_half(given: Inputs) -> Outcome:
-    """Interpolate the same features in half precision."""
-    return encode(reference, {name: x.half() if x.is_floating_point() else x for name, x in given.items()})
 
 
 def pixel_inputs(precision: Precision) -> Inputs:
@@ -299,13 +291,6 @@ def adam(module: ModuleType, given: Inputs) -> Outcome:
     return Outcome({"table": table})
 
 
-def adam_in_half(given: Inputs) -> Outcome:
-    """Compute Adam's first step with its state in half precision."""
-    half = given["gradients"].half()
-    moment, square = 0.1 * half, 0.01 * half * half
-    return Outcome({"table": -RATE * (moment / 0.1) / ((square / 0.01).sqrt() + EPS)})
-
-
 def contract_inputs(radii: Sequence[float], precision: Precision) -> Inputs:
     """Return points at some radii in a few directions."""
     points = [tuple(r * x for x in d) for r in radii for d in cases.DIRECTIONS]
@@ -354,8 +339,3 @@ def project(module: ModuleType, given: Inputs) -> Outcome:
     back = module.back_project(given["gains"], *lines, shape=cases.VOLUME_SHAPE, **grid)
     sizes = {"transpose": back.abs().max().expand_as(back)}
     return Outcome({"integrals": integrals, "transpose": back}, value_sizes=sizes)
-
-
-def project_in_single(given: Inputs) -> Outcome:
-    """Compute the same with lines in float32."""
-    return project(reference, {name: values.float() for name, values in given.items()})

@@ -1,4 +1,4 @@
-"""The table of hard cases: operation, inputs, bounds and the textbook's formula of each; all rows of the selftest."""
+"""The table of hard cases: operation, inputs and bounds of each; all rows of the selftest."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -10,7 +10,7 @@ import torch
 
 from nerfcli import kernels
 from nerfcli.kernels import reference
-from nerfcli.kernels.selftest import cases, operations, textbook
+from nerfcli.kernels.selftest import cases, operations
 from nerfcli.kernels.selftest.measure import Errors, Precision, Row
 
 SINGLE, HALF, COMPILED, OF_GPU = "float32", "bfloat16", "compiled", "GPU kernels"
@@ -26,7 +26,7 @@ class Check:
     """One hard case of one operation.
 
     Args:
-        inputs: returns the inputs, rounded to a precision, on which `run` and, by its `formula`, `textbook` operate.
+        inputs: returns the inputs, rounded to a precision, on which `run` operates.
         bound: returns the bounds of values and gradients in a precision, which `reason` derives.
         precisions: names of the precisions to test.
     """
@@ -38,8 +38,6 @@ class Check:
     bound: Callable[[Precision], Errors]
     reason: str
     precisions: tuple[str, ...] = (SINGLE, HALF, COMPILED)
-    formula: str = ""
-    textbook: Callable[[operations.Inputs], operations.Outcome] | None = None
 
     def is_for(self, precision: Precision) -> bool:
         """Return True if the case is tested in a precision and has correct digits there."""
@@ -56,9 +54,6 @@ def row_of(check: Check, precision: Precision) -> Row:
     if precision.device != "cpu":
         torch.cuda.synchronize(precision.device)
     seconds = time.perf_counter() - start
-    plain = None
-    if check.textbook is not None and precision.parts is reference:
-        plain = operations.errors(check.textbook(inputs), wanted, tiny=precision.tiny)
     return Row(
         case=check.case,
         operation=check.operation,
@@ -66,8 +61,6 @@ def row_of(check: Check, precision: Precision) -> Row:
         errors=operations.errors(got, wanted, tiny=precision.tiny),
         bounds=check.bound(precision),
         reason=check.reason,
-        formula=check.formula,
-        textbook=plain,
         seconds=seconds,
     )
 
@@ -96,8 +89,6 @@ def light_checks() -> Iterator[Check]:
             partial(operations.light_bound, rays),
             "u (8 + (n + 2) (1 + tau)), n and tau as far as light comes, compiled 8 u; twice for a gradient, relative "
             "to its terms",
-            formula="1 - exp, cumulative product, 1 - sum of weights",
-            textbook=partial(operations.composite, textbook),
         )
     yield Check(
         "optical depth in front of an interval that is 1e11 times as thick, 1 to 4096",
@@ -108,8 +99,6 @@ def light_checks() -> Iterator[Check]:
             (2 if precision.compiled else 17 if precision.name == HALF else 4097) * precision.unit
         ),
         "(n + 1) u: sums of n terms that are all positive, 16 in bfloat16; compiled 2 u: sums in float64",
-        formula="cumulative sum less the own part",
-        textbook=partial(operations.before, textbook),
     )
     yield Check(
         "distortion of a far, thin surface",
@@ -119,8 +108,6 @@ def light_checks() -> Iterator[Check]:
         lambda precision: operations.both(8 if precision.compiled else 192, precision),
         "3 n u: sums of n terms that are all positive; compiled 8 u: sums in float64",
         (SINGLE, COMPILED),
-        formula="difference of running sums",
-        textbook=partial(operations.distortion, textbook),
     )
 
 
@@ -130,7 +117,7 @@ DEPTHS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("mean depth, of next to no light and of none", ("conditional",)),
     ("spread of depth, of shells and fog", ("spread",)),
     ("mean depth of the interval that stops most light", ("max-weight",)),
-    ("median and quantiles, not reached and inside intervals", operations.QUANTILES),
+    ("median and quantiles, not reached and inside intervals", tuple(operations.QUANTILES)),
 )
 
 
@@ -144,8 +131,6 @@ def depth_check(case: str, columns: tuple[str, ...], rays: list[cases.Ray]) -> C
         partial(operations.ray_termination, columns),
         lambda precision: operations.depth_bound(operations.meaningful(rays, precision), factor, precision),
         "u (16 + (n + 2) (1 + tau)), compiled 16 u; of a spread 4 times that",
-        formula="weights by 1 - exp at midpoints, their sum clamped at 1e-10",
-        textbook=partial(operations.ray_termination, columns, textbook),
     )
 
 
@@ -164,8 +149,6 @@ def look_up_checks() -> Iterator[Check]:
             "16 u, of a gradient 16 + n, relative to the largest of the level; where places are rounded as they are "
             "counted in cells, times the resolution",
             (SINGLE, COMPILED),
-            formula="places, table and sums in float16",
-            textbook=operations.encode_in_half,
         )
     yield Check(
         "pixels beyond number 2^24, first, last and only ones of their photos",
@@ -175,8 +158,6 @@ def look_up_checks() -> Iterator[Check]:
         lambda precision: Errors(4 * precision.unit),
         "4 u: a sum of three products, relative to its terms",
         (SINGLE, COMPILED),
-        formula="numbers of pixels in float32",
-        textbook=lambda given: operations.pixel_rays(reference, {**given, "chosen": given["chosen"].float().long()}),
     )
 
 
@@ -189,8 +170,6 @@ def step_checks() -> Iterator[Check]:
         operations.density,
         lambda precision: operations.both(8, precision),
         "8 u: exp within 15; constant beyond, with a gradient that does not vanish",
-        formula="exp",
-        textbook=lambda given: operations.gradients_of(torch.exp, given["logarithms"]),
     )
     yield Check(
         "Adam's first step, gradients 1e-17 to 1e10",
@@ -200,8 +179,6 @@ def step_checks() -> Iterator[Check]:
         lambda precision: Errors(16 / (1 - operations.BETAS[1]) * precision.unit),
         "16 u / (1 - beta2): 1 - beta2 of a rounded beta2; eps = 1e-15 counts, as the state is float32",
         (SINGLE, COMPILED),
-        formula="state in float16",
-        textbook=operations.adam_in_half,
     )
     for name, radii in cases.CONTRACTED:
         yield Check(
@@ -212,8 +189,6 @@ def step_checks() -> Iterator[Check]:
             lambda precision: Errors(8 * precision.unit, 64 * precision.unit),
             "8 roundings u; of the gradient 64, relative to the largest of its point",
             (SINGLE, HALF),
-            formula="where(|x| <= 1, x, (2 - 1 / |x|) x / |x|)",
-            textbook=lambda given: operations.gradients_of(textbook.contract, given["points"]),
         )
     for name, full in (("rays along axes, and in the plane of a side", True), ("empty occupancy", False)):
         yield Check(
@@ -238,8 +213,6 @@ def volume_check(thickness: float) -> Check:
         lambda precision: Errors((4 if precision.compiled else 4 * planes + 4) * precision.unit),
         "(4 n + 4) u: sums over n planes of 4 voxels, all positive; compiled 4 u: sums in float64",
         (SINGLE, COMPILED),
-        formula="lines in float32",
-        textbook=operations.project_in_single,
     )
 
 
