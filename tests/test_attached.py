@@ -1,6 +1,5 @@
 """What is attached to the camera: painted into photos of textured walls, at the same place in each of them."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,16 +7,15 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from test_stereo import TEXTURE, truth
+from test_stereo import TEXTURE, truth, written
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.loading import load_scene
 from nerfcli.evaluate.photos import held_out_photos
 from nerfcli.matching.attached import FEWEST_PHOTOS, attached_masks, masks_of
-from nerfcli.photos.images import read_image, write_png
+from nerfcli.photos.images import read_image
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.poses.engine import turntable
 from nerfcli.poses.engine.turntable import mask_turning_object, recall_masks
@@ -144,16 +142,8 @@ def test_cameras_have_masks_of_their_own():
 @pytest.fixture
 def capture(tmp_path: Path) -> Capture:
     """Photos with a gripper, of which the last one is held out."""
-    frames = []
-    for number, one in enumerate(walls(GRIPPER)):
-        write_png(tmp_path / "walls" / "images" / f"{number}.png", one.pixels)
-        pose = one.frame.world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])
-        frames.append({"file_path": f"images/{number}.png", "transform_matrix": pose.tolist()})
-    named = [frame["file_path"] for frame in frames]
-    split = {"train_filenames": named[:-1], "test_filenames": named[-1:]}
-    lens = {"w": 320, "h": 240, "fl_x": 300.0, "fl_y": 300.0, "cx": 160.0, "cy": 120.0}
-    (tmp_path / "walls" / "transforms.json").write_text(json.dumps({**lens, "frames": frames, **split}))
-    return load_scene(tmp_path / "walls")
+    frames = written(tmp_path / "walls", walls(GRIPPER))
+    return Capture(frames, np.zeros((0, 3)), root=tmp_path / "walls", test_names=frozenset({frames[-1].name}))
 
 
 @pytest.mark.parametrize("fixed", [(), ("occluders",)], ids=["by default", "without occluders"])

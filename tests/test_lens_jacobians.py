@@ -124,22 +124,24 @@ def test_bearings_turn_as_pixels_move(model, seed):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_derivatives_are_finite_and_zero_where_nothing_is_seen(model):
+def test_answers_are_finite_and_derivatives_zero_where_nothing_is_seen(model):
     camera = random_camera(model, np.random.default_rng(1))
-    points = np.array(
-        [[0, 0, 0], [np.nan, 0, 1], [np.inf, 0, 1], [0, 1, 0], [0, 0, -1], [0, 0, 1], [1e-200, 0, 1e-200]]
-    )
+    nowhere = [[0, 0, 0], [np.nan, 0, 1], [np.inf, 0, 1]]
+    points = np.array([*nowhere, [0, 0, 1], [0, 1, 0], [0, 0, -1], [1, 0, 0], [1e-200, 0, 1e-200], [1e150, 0, 1e150]])
     by_point, by_parameters, valid = camera.project_jacobian(points)
-    assert np.isfinite(by_point).all()
-    assert np.isfinite(by_parameters).all()
+    assert np.isfinite(camera.project(points)[0]).all()
     assert not valid[:3].any()
-    assert valid[5]
-    np.testing.assert_array_equal(by_point[~valid], 0)
-    np.testing.assert_array_equal(by_parameters[~valid], 0)
-    by_pixel, valid = camera.bearing_jacobian(np.array([[np.nan, 0], [1e300, 0], [600, 450]]))
-    assert np.isfinite(by_pixel).all()
-    np.testing.assert_array_equal(by_pixel[~valid], 0)
-    assert not valid[0]
-    assert valid[2]
-    assert camera.project_jacobian(np.zeros((0, 3)))[1].shape == (0, 2, len(camera.params))
-    assert camera.bearing_jacobian(np.zeros((0, 2)))[0].shape == (0, 3, 2)
+    assert valid[3]
+    pixels = np.array([[np.nan, 1], [np.inf, 1], [600, 450], [1e300, 0], [1e12, -1e12], [0, 0], [WIDTH, HEIGHT]])
+    by_pixel, found = camera.bearing_jacobian(pixels)
+    assert np.isfinite(camera.bearings(pixels)[0]).all()
+    assert not found[:2].any()
+    assert found[2]
+    for derivatives, known in ((by_point, valid), (by_parameters, valid), (by_pixel, found)):
+        assert np.isfinite(derivatives).all()
+        np.testing.assert_array_equal(derivatives[~known], 0)
+    nothing = np.zeros((0, 3))
+    assert [x.shape for x in camera.project_jacobian(nothing)] == [(0, 2, 3), (0, 2, len(camera.params)), (0,)]
+    assert [x.shape for x in camera.bearing_jacobian(nothing[:, :2])] == [(0, 3, 2), (0,)]
+    assert camera.project(nothing)[0].shape == (0, 2)
+    assert camera.bearings(nothing[:, :2])[0].shape == (0, 3)

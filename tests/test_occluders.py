@@ -1,6 +1,5 @@
 """What hides a surface in one photo, on textured walls with a disc of leaves painted into one of the photos."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,17 +8,16 @@ import numpy as np
 import pytest
 import torch
 from test_matched_exposures import exposed
-from test_stereo import LENS, OFFSETS, PINHOLE, TEXTURE, found, photo, truth
+from test_stereo import LENS, OFFSETS, PINHOLE, TEXTURE, found, photo, truth, written
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.loading import load_scene
 from nerfcli.errors import UserError
 from nerfcli.matching import occluders
 from nerfcli.matching.occluders import occluder_masks
 from nerfcli.matching.stereo import DenseDepth
-from nerfcli.photos.images import read_image, write_png
+from nerfcli.photos.images import read_image
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.training import preparation, schedule, selection
 from nerfcli.training.fitting import TrainingInputs
@@ -209,20 +207,11 @@ def test_a_pool_draws_no_pixel_that_is_left_out(is_masked):
 @pytest.fixture
 def capture(tmp_path: Path) -> Capture:
     """Six photos of the walls with the disc in front of the second one, and an odd one out that is held out."""
-    folder = tmp_path / "walls"
     photos = [photo(x, camera=Camera.pinhole(400, 300, 360.0), contrast=1.5) for x in np.linspace(-0.5, 0.5, 7)]
     large = [cv2.resize(part.astype(np.uint8), (400, 300), interpolation=cv2.INTER_LINEAR) for part in (DISC, leaves())]
     photos[1] = painted(photos[1], large[0] > 0, large[1])
-    frames = []
-    for number, one in enumerate(photos):
-        write_png(folder / "images" / f"{number}.png", one.pixels)
-        pose = one.frame.world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])
-        frames.append({"file_path": f"images/{number}.png", "transform_matrix": pose.tolist()})
-    named = [frame["file_path"] for frame in frames]
-    split = {"train_filenames": named[:6], "test_filenames": named[6:]}
-    lens = {"w": 400, "h": 300, "fl_x": 360.0, "fl_y": 360.0, "cx": 200.0, "cy": 150.0}
-    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames, **split}))
-    return load_scene(folder)
+    frames = written(tmp_path / "walls", photos)
+    return Capture(frames, np.zeros((0, 3)), root=tmp_path / "walls", test_names=frozenset({frames[-1].name}))
 
 
 @pytest.mark.parametrize("model", ["default", "auto"])

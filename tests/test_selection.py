@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -254,15 +255,6 @@ def test_points_are_not_tried_where_the_user_decides_alpha_is_given_or_there_are
     assert len(scripted.begun) == 1
 
 
-@pytest.mark.parametrize(("misses", "tells"), [(0.3, True), (0.7, False)])
-def test_points_are_used_only_where_the_cameras_fit(misses, tells):
-    facts = replace(FITTED, cameras=CameraCheck(0.0, 0.001, (misses, misses), 1000))
-    components, _ = with_evidence(Components(), replace(facts, points=7))
-    assert components.points == (0.1 if tells else 0.0)
-    assert with_evidence(Components(cameras="poses"), POINTED)[0].points == 0.0
-    assert may_use_points(Components(points=0.2), ("points",), has_alpha=True, cameras=facts.cameras)
-
-
 @pytest.mark.parametrize(("far", "kept"), [(0.05, False), (0.15, True)])
 def test_a_sky_that_signs_speak_for_is_kept_at_a_smaller_gain(far, kept):
     """Gains of 0.13 and 0.45 dB with two seeds: one to two standard errors above the least gain that counts."""
@@ -502,56 +494,64 @@ def test_what_is_supported_must_not_lose_more_than_its_error():
         assert decision.kept == kept  # mean m and distance d of two seeds: m > -d / 2
 
 
-def test_depths_of_stereo_matching_come_with_evidence_and_as_the_user_says():
-    facts = replace(FITTED, points=900, stereo=80_000)
-    both = Components(points=0.1, stereo=True)
-    assert with_evidence(Components(), facts)[0] == both
-    seen = [decision.seen for decision in with_evidence(Components(), facts)[1]]
-    said = "several photos agree on the depth of 80,000 pixels"
-    assert seen == ["900 pixels see a 3D point at a known distance", said]
-    assert with_evidence(Components(), replace(facts, stereo=0))[0] == Components(points=0.1)
-    assert with_evidence(Components(points=0.3), replace(facts, fixed=("points",)))[0] == replace(both, points=0.3)
-    assert with_evidence(Components(), replace(facts, fixed=("points",)))[0] == Components()
-    assert with_evidence(Components(), replace(facts, fixed=("stereo",)))[0] == Components(points=0.1)
+BOTH = Components(points=0.1, stereo=True)
+SEEN = replace(FITTED, points=900, stereo=80_000)
+# What photos show besides points and depths from stereo, and the components with which a training then begins.
+EVIDENCE: list[tuple[dict[str, Any], Components]] = [
+    ({}, BOTH),
+    ({"stereo": 0}, Components(points=0.1)),
+    ({"fixed": ("stereo",)}, Components(points=0.1)),
+    ({"fixed": ("points",)}, Components()),
+    ({"has_alpha": True}, Components()),
+    ({"cameras": CameraCheck(0.0, 0.001, (0.3, 0.3), 1000)}, BOTH),
+    ({"cameras": CameraCheck(0.0, 0.001, (0.7, 0.7), 1000)}, Components()),
+    ({"exposure_spread": 0.1}, BOTH),
+    ({"exposure_spread": 0.26, "photos": 16}, replace(BOTH, exposure="matched")),
+    ({"exposure_spread": 0.26, "photos": 17}, replace(BOTH, exposure="learned")),
+    ({"exposure_spread": 0.26, "has_alpha": True}, Components()),
+    ({"occluded_fraction": 0.013}, replace(BOTH, occluders=True)),
+    ({"occluded_fraction": 0.013, "fixed": ("occluders",)}, BOTH),
+    ({"occluded_fraction": 0.013, "has_alpha": True}, Components()),
+    ({"sky_confirmed": True}, replace(BOTH, background="sphere")),
+    ({"sky_confirmed": True, "fixed": ("background",)}, BOTH),
+]
 
 
-def test_exposures_are_kept_on_evidence():
-    facts = replace(FITTED, points=900, stereo=80_000, exposure_spread=0.26)
-    both = Components(points=0.1, stereo=True)
-    assert with_evidence(Components(), facts)[0] == replace(both, exposure="matched")
-    many = replace(facts, photos=17)
-    assert with_evidence(Components(), many)[0] == replace(both, exposure="learned")
-    assert with_evidence(Components(), replace(many, photos=16))[0] == replace(both, exposure="matched")
-    assert with_evidence(Components(), facts)[1][2].seen == "photos differ by 0.38 stops at the same points"
-    assert with_evidence(Components(), replace(facts, exposure_spread=0.1))[0] == both
-    fixed = replace(facts, fixed=("exposure",))
-    assert with_evidence(Components(exposure="exif"), fixed)[0] == replace(both, exposure="exif")
-    assert with_evidence(Components(), replace(facts, has_alpha=True))[0] == Components()
-    for known in (replace(both, exposure="matched"), replace(both, exposure="learned")):
+@pytest.mark.parametrize(("shown", "expected"), EVIDENCE, ids=str)
+def test_a_training_begins_with_what_photos_support(shown, expected):
+    components, decisions = with_evidence(Components(), replace(SEEN, **shown))
+    assert components == expected
+    assert all(decision.kept for decision in decisions)
+
+
+def test_evidence_is_reported_in_words():
+    facts = replace(SEEN, exposure_spread=0.26, occluded_fraction=0.013, sky_fraction=0.2, sky_confirmed=True)
+    assert [decision.seen for decision in with_evidence(Components(), facts)[1]] == [
+        "900 pixels see a 3D point at a known distance",
+        "several photos agree on the depth of 80,000 pixels",
+        "photos differ by 0.38 stops at the same points",
+        "1.3 % of the pixels hide surfaces that other photos see",
+        "20 % of the pixels look like a sky, with hardly any surface in front",
+    ]
+
+
+def test_evidence_changes_nothing_that_was_requested():
+    fixed = replace(SEEN, exposure_spread=0.26, fixed=("points", "exposure"))
+    requested = Components(points=0.3, exposure="exif")
+    assert with_evidence(requested, fixed)[0] == replace(requested, stereo=True)
+    assert with_evidence(Components(cameras="poses"), SEEN)[0].points == 0.0
+    checked = CameraCheck(0.0, 0.001, (0.3, 0.3), 1000)
+    assert may_use_points(Components(points=0.2), ("points",), has_alpha=True, cameras=checked)
+
+
+def test_what_evidence_has_decided_is_not_tried():
+    facts = replace(SEEN, has_exif=True, exposure_spread=0.26)
+    for known in (replace(BOTH, exposure="matched"), replace(BOTH, exposure="learned")):
         assert "exposure" not in [d.component for d in proposals(known, signs(0.0), facts)[1]]  # not declined, too
-        tried, _ = proposals(known, signs(0.3, 0.0), replace(facts, has_exif=True))
-        assert "exposure" not in dict(changes_of(tried))
-
-
-def test_what_hides_surfaces_is_left_out_if_there_is_any():
-    facts = replace(FITTED, points=900, stereo=80_000, occluded_fraction=0.013)
-    both = Components(points=0.1, stereo=True)
-    model, decisions = with_evidence(Components(), facts)
-    assert model == replace(both, occluders=True)
-    assert decisions[2].seen == "1.3 % of the pixels hide surfaces that other photos see"
-    assert with_evidence(Components(), replace(facts, occluded_fraction=0.0))[0] == both
-    assert with_evidence(Components(), replace(facts, fixed=("occluders",)))[0] == both
-    assert with_evidence(Components(), replace(facts, has_alpha=True))[0] == Components()
-
-
-def test_a_sky_that_points_confirm_is_in_the_model_from_the_start():
-    facts = replace(FITTED, sky_fraction=0.2, sky_confirmed=True)
-    model, decisions = with_evidence(Components(), facts)
-    assert model == Components(background="sphere")
-    assert decisions[0].kept
-    assert decisions[0].seen == "20 % of the pixels look like a sky, with hardly any surface in front"
-    assert with_evidence(Components(), replace(facts, fixed=("background",)))[0] == Components()
-    assert ("background", "sphere") not in changes_of(proposals(model, signs(0.0, 0.3), facts)[0])
+        assert "exposure" not in dict(changes_of(proposals(known, signs(0.3, 0.0), facts)[0]))
+    sky = replace(SEEN, sky_fraction=0.2, sky_confirmed=True)
+    tried, _ = proposals(Components(background="sphere"), signs(0.0, 0.3), sky)
+    assert ("background", "sphere") not in changes_of(tried)
 
 
 def test_a_sky_that_pixels_look_like_is_tried_and_kept_if_it_does_not_lose():

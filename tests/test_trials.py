@@ -36,10 +36,10 @@ def inputs_of(scene: Capture) -> TrainingInputs:
     return TrainingInputs(SETTINGS, extent, PixelPool(photos, extent.training_from_scene, torch.device("cpu")))
 
 
-def fitting_of(trials: Trials, components: Components, cameras_from: float = 0.0) -> Fitting:
+def fitting_of(trials: Trials, components: Components) -> Fitting:
     """Return a fresh training on the pixels of trials."""
     settings = replace(trials._inputs.settings, components=components)
-    return Fitting(replace(trials._inputs, settings=settings), cameras_from=cameras_from)
+    return Fitting(replace(trials._inputs, settings=settings))
 
 
 @pytest.fixture(scope="module")
@@ -103,18 +103,6 @@ def test_a_start_that_cannot_come_to_the_fewest_steps_ends_at_once(trials, monke
     assert gone[-1] > 60  # at first the fewest steps seem possible
 
 
-def test_a_trial_has_its_cameras_learn_from_the_fork_on(trials, start, monkeypatch):
-    begun: list[float] = []
-
-    def fitting(inputs: TrainingInputs, *, cameras_from: float) -> Fitting:
-        begun.append(cameras_from)
-        return Fitting(inputs, cameras_from=cameras_from)
-
-    monkeypatch.setattr("nerfcli.training.trials.Fitting", fitting)
-    trials.go_on(start, Components(view=0), seed=0, steps=0)
-    assert begun == [0.02]  # where the start forked
-
-
 def test_the_learning_rate_falls_by_half_a_cosine_after_its_warm_up(trials):
     """Values by hand: from 0.01 to 0.001, the mean of both halfway."""
     fitting = fitting_of(trials, Components(view=0))
@@ -150,14 +138,18 @@ def test_large_tables_have_their_levels_by_steps(trials, monkeypatch, rows_of_la
     assert moved == learning
 
 
-def test_cameras_learn_from_the_fork_on(trials, start):
-    """A step at the fork, after 0.6 of the budget, does not move the cameras; a later one does."""
-    fitting = fitting_of(trials, Components(view=0, cameras="poses"), cameras_from=0.6)
-    trials._take_up(fitting, start)
+def test_cameras_learn_from_the_fork_on(trials, start, monkeypatch):
+    """A step at the fork, after 0.02 of the budget, does not move the cameras; a later one does."""
+    made: list[Fitting] = []
+    monkeypatch.setattr(
+        "nerfcli.training.trials.Fitting", lambda *args, **named: made.append(Fitting(*args, **named)) or made[-1]
+    )
+    trials.go_on(start, Components(view=0, cameras="poses"), seed=0, steps=0)
+    (fitting,) = made
     assert fitting.appearance.cameras is not None
     motions = present(fitting.appearance.cameras.poses).motions
     given = motions.clone()
-    fitting.advance(0.6)
+    fitting.advance(0.02)
     assert torch.equal(motions, given)
     fitting.advance(0.8)
     assert not torch.equal(motions, given)
