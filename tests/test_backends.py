@@ -4,14 +4,13 @@ import importlib
 import math
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
 import pytest
 import torch
-from oracles import march_through_slabs
 from present import present
 from torch import Tensor
 
@@ -197,49 +196,6 @@ def test_compiled_pictures_leave_out_no_more_of_a_ray_than_they_may():
     assert 0.99 * negligible < 2.0 * float(seen.truncation_error.max()) <= negligible * (1 + 1e-6)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_sums_along_rays_are_those_of_a_double_loop(dtype):
-    """Colour, transmittance, distortion and distance of light from its target, from the samples shown to `trace`."""
-    field = field_of(COMPILED, (NumbaBackend if dtype == torch.float32 else Backend)(CPU), dtype)
-    rays, march = rays_and_march(5, dtype)
-    distances, background = torch.tensor([1.2, 1.9], dtype=dtype), torch.rand(5, 3, dtype=dtype)
-    shown: dict[str, Tensor] = {}
-
-    def trace(name: str, values: Tensor, index: Tensor) -> None:
-        shown[name], shown["index"] = values.detach(), index
-
-    found = field.backend.trace_rays(rays, march, field.medium(), background=background).intervals
-    seen = field.backend.render_rays(
-        rays, march, field.medium(), Targets(distortion=True, distances=distances), background=background, trace=trace
-    )
-    assert int(seen.samples) == len(found.starts) > 20
-    density, rgb = shown["density of samples"].double(), shown["colour of samples"].double()
-    starts, ends, offsets = found.starts.double(), found.ends.double(), found.offsets
-    assert torch.equal(kernels.ray_indices(offsets), shown["index"])
-    contracted = [[t / 2 if t <= 1 else 1 - 1 / (2 * t) for t in edge.tolist()] for edge in (starts, ends)]
-    expected: list[list[object]] = [[], [], [], []]
-    for ray in range(5):
-        part = slice(int(offsets[ray]), int(offsets[ray + 1]))
-        lengths, behind = (ends - starts)[part].tolist(), background[ray].tolist()
-        weights, passing, colour = march_through_slabs(density[part].tolist(), lengths, rgb[part].tolist(), behind)
-        spans = list(zip(contracted[0][part], contracted[1][part], strict=True))
-        middles = [(near + far) / 2 for near, far in spans]
-        weighted = list(zip(weights, middles, strict=True))
-        pairs = sum(w * v * abs(m - n) for w, m in weighted for v, n in weighted)
-        own = sum(w * w * (far - near) for w, (near, far) in zip(weights, spans, strict=True)) / 3
-        expected[0].append(colour.tolist())
-        expected[1].append(passing)
-        expected[2].append(pairs + own)
-        if ray >= 3:
-            target = float(distances[ray - 3])
-            places = ((starts + ends) / 2)[part].tolist()
-            misses = [min(1.0, abs(t - target) / (0.25 * target)) for t in places]
-            expected[3].append(sum(w * miss for w, miss in zip(weights, misses, strict=True)) + passing)
-    for value, wanted in zip(seen[:4], expected, strict=True):
-        exact = torch.tensor(wanted, dtype=torch.float64)
-        torch.testing.assert_close(value.detach().double(), exact, rtol=1e-5, atol=1e-6)
-
-
 UNEVEN = torch.linspace(0.55, 2.0, 40, dtype=torch.float64).square()
 
 
@@ -273,7 +229,7 @@ def widths_by_hand(rays: Rays, starts: Tensor, ends: Tensor, offsets: Tensor) ->
 
 
 def radiance_by_hand(field: Field, rays: Rays, kept: list[list[tuple[float, float]]]) -> tuple[Tensor, ...]:
-    """Return densities, colours, lengths, starts and rays of all intervals, from single operations."""
+    """Return densities, colours, starts, ends and rays of all intervals, from single operations."""
     flat = [span for spans in kept for span in spans]
     starts, ends = torch.tensor(flat, dtype=torch.float64).reshape(-1, 2).unbind(1)
     index = torch.tensor([ray for ray, spans in enumerate(kept) for _ in spans], dtype=torch.int64)
@@ -288,20 +244,24 @@ def radiance_by_hand(field: Field, rays: Rays, kept: list[list[tuple[float, floa
         density, rgb = reference.radiance(code, harmonics, index, medium.layers)
     else:
         density, rgb = medium.radiance(coordinates, rays.directions, index)
-    return density, rgb, ends - starts, starts, index
+    return density, rgb, starts, ends, index
 
 
 @pytest.mark.parametrize("near", [None, 1.0, 1.3])
 @pytest.mark.parametrize("name", MEDIA)
 def test_rays_of_a_training_are_single_operations_one_after_the_other(name, near):
-    """Values and gradients by a loop, independent of `kernels.composition`, which both backends share."""
+    """Values and gradients by loops, independent of `kernels.composition`, which both backends share."""
     field = field_of(MEDIA[name], Backend(CPU), torch.float64)
     rays, march = rays_and_march(4, torch.float64, contraction=field.settings.contraction)
     rays = wide(rays)._replace(origins=rays.origins + 1.2 * rays.directions)
     march = march._replace(edges=UNEVEN, max_optical_depth=0.4)
     background = torch.rand(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    kept = samples_by_hand(field, rays, march)
+    distances = torch.tensor([1.1 * spans[0][0] for spans in kept[2:]], dtype=torch.float64)  # near the first samples
 
-    def gradients(loss: Tensor, given: Rays) -> list[Tensor | None]:
+    def gradients(sums: Sequence[Tensor], given: Rays) -> list[Tensor | None]:
+        colour, passing, apart, off = sums
+        loss = (colour * background.flip(0)).sum() + passing.square().sum() + apart.sum() + off.square().sum()
         wanted = (given.origins, given.directions, *field.parameters())
         return list(torch.autograd.grad(loss, wanted, allow_unused=True))
 
@@ -310,31 +270,40 @@ def test_rays_of_a_training_are_single_operations_one_after_the_other(name, near
         return rays._replace(origins=origins, directions=directions)
 
     given = learnable()
-    sums = field.backend.render_rays(given, march, field.medium(), Targets(near=near), background=background)
-    found = gradients((sums.rgb * background.flip(0)).sum() + sums.transmittance.square().sum(), given)
+    targets = Targets(near, True, distances)
+    sums = field.backend.render_rays(given, march, field.medium(), targets, background=background)
+    found = gradients(sums[:4], given)
 
     given = learnable()
-    kept = samples_by_hand(field, given, march)
-    density, rgb, lengths, starts, index = radiance_by_hand(field, given, kept)
+    density, rgb, starts, ends, index = radiance_by_hand(field, given, kept)
     if near is not None:
         scale = (starts / near).square().clamp_max(1.0)
         assert (scale < 1).any()
         density = scale * density + (1 - scale) * density.detach()
         rgb = scale[:, None] * rgb + (1 - scale[:, None]) * rgb.detach()
-    colours, passing = [], []
+    near_ends, far_ends = (torch.where(t <= 1, t / 2, 1 - 1 / (2 * t)) for t in (starts, ends))
+    middles = (near_ends + far_ends) / 2
+    colours, passing, apart, off = [], [], [], []
     for ray in range(4):
-        left, colour = torch.ones((), dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+        left, colour, weighted = torch.ones((), dtype=torch.float64), torch.zeros(3, dtype=torch.float64), []
         for k in (index == ray).nonzero()[:, 0]:
-            through = torch.exp(-density[k] * lengths[k])
+            through = torch.exp(-density[k] * (ends[k] - starts[k]))
+            weighted.append((left * (1 - through), k))
             colour = colour + left * (1 - through) * rgb[k]
             left = left * through
         colours.append(colour + left * background[ray])
         passing.append(left)
-    expected = gradients((torch.stack(colours) * background.flip(0)).sum() + torch.stack(passing).square().sum(), given)
+        pairs = sum(w * v * abs(middles[k] - middles[i]) for w, k in weighted for v, i in weighted)
+        apart.append(pairs + sum(w * w * (far_ends[k] - near_ends[k]) for w, k in weighted) / 3)
+        if ray >= 2:
+            distance = distances[ray - 2]
+            misses = [abs((starts[k] + ends[k]) / 2 - distance) / (0.25 * distance) for _, k in weighted]
+            off.append(left + sum(w * min(miss, 1.0) for (w, _), miss in zip(weighted, misses, strict=True)))
+    by_hand = [torch.stack(values) for values in (colours, passing, apart, off)]
     assert int(sums.samples) == sum(map(len, kept)) > 10
-    torch.testing.assert_close(sums.rgb, torch.stack(colours), rtol=1e-9, atol=1e-12)
-    torch.testing.assert_close(sums.transmittance, torch.stack(passing), rtol=1e-9, atol=1e-12)
-    for value, wanted in zip(found, expected, strict=True):
+    for value, wanted in zip(sums[:4], by_hand, strict=True):
+        torch.testing.assert_close(value, wanted, rtol=1e-9, atol=1e-12)
+    for value, wanted in zip(found, gradients(by_hand, given), strict=True):
         assert (value is None) == (wanted is None)
         if value is not None and wanted is not None:
             torch.testing.assert_close(value, wanted, rtol=1e-7, atol=1e-10)
@@ -351,17 +320,18 @@ def test_rays_of_a_picture_are_single_operations_one_after_the_other(name):
     seen = field.backend.trace_rays(rays, march, field.medium(), options, background=background)
     with torch.no_grad():
         kept = samples_by_hand(field, rays, march)
-        density, rgb, lengths, _, index = radiance_by_hand(field, rays, kept)
+        density, rgb, starts, ends, index = radiance_by_hand(field, rays, kept)
     greys = stops = 0
     for ray in range(6):
         left, colour, error = 1.0, torch.zeros(3, dtype=torch.float64), 0.0
         for k in (index == ray).nonzero()[:, 0]:
-            weight = left * -math.expm1(-float(density[k] * lengths[k]))
+            depth = float(density[k] * (ends[k] - starts[k]))
+            weight = left * -math.expm1(-depth)
             grey = weight <= negligible / len(kept[ray])
             greys += grey
             colour += weight * (0.5 if grey else rgb[k])
             error += 0.5 * weight * grey
-            left *= math.exp(-float(density[k] * lengths[k]))
+            left *= math.exp(-depth)
         behind = float(torch.maximum(background[ray], 1 - background[ray]).max())
         if left <= math.exp(-march.max_optical_depth) * (1 + 1e-5):
             stops += 1

@@ -3,11 +3,11 @@
 import math
 from decimal import Decimal, localcontext
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from oracles import quadrature_of_end_density
 
 from nerfcli.kernels import RayTermination, numba_cpu
 from nerfcli.kernels.reference import depth
@@ -39,6 +39,19 @@ def test_splitting_an_interval_changes_nothing_but_max_weight(seed, cut, at, exp
             getattr(split, name), getattr(whole, name), rtol=1e-11, atol=1e-14 if name == "spread" else 0,
             equal_nan=True, msg=lambda text, name=name: f"{name}: {text}",
         )  # fmt: skip
+
+
+def quadrature_of_end_density(density, starts, ends, steps=20000):
+    """Return the integrals of p(t), t p(t) and t^2 p(t), p = T sigma, for a piecewise constant density, by the midpoint
+    rule."""
+    moments, tau = np.zeros(3), 0.0
+    for s, t0, t1 in zip(density, starts, ends, strict=True):
+        h = (t1 - t0) / steps
+        t = t0 + (np.arange(steps) + 0.5) * h
+        p = s * np.exp(-(tau + s * (t - t0)))
+        moments += np.stack([p, t * p, t * t * p]).sum(1) * h
+        tau += s * (t1 - t0)
+    return moments
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -74,18 +74,6 @@ def random_grid(contrast: float, generator: torch.Generator, *, antialias: bool 
     return HashGrid(table, RESOLUTIONS, weights, antialias=antialias)
 
 
-def test_radiance_ends_where_the_logarithm_of_a_density_does():
-    # Weights that carry the first feature through, one path for each sign.
-    weights = tuple(torch.zeros(shape) for shape in WEIGHTS)
-    weights[0][0, 0], weights[0][1, 0], weights[1][0, 0], weights[1][0, 1] = 1.0, -1.0, 1.0, -1.0
-    encoded = torch.zeros(4, 32)
-    encoded[:, 0] = torch.tensor([-60.0, -16.0, 16.0, 60.0])
-    wanted = torch.tensor([-15.0, -15.0, 15.0, 15.0]).exp()
-    rays = torch.zeros(4, dtype=torch.int64)
-    torch.testing.assert_close(numba_cpu.radiance(encoded, torch.zeros(1, 16), rays, weights)[0], wanted)
-    torch.testing.assert_close(numba_cpu.density(encoded, weights), wanted)
-
-
 @pytest.mark.parametrize(
     ("rays", "contraction"),
     [(0, "l2"), (1, "l2"), (5, "none"), *((123, contraction) for contraction in kernels.CONTRACTIONS), (700, "l2")],
