@@ -134,17 +134,17 @@ def test_missing_points_that_were_requested_are_an_error(spheres, tmp_path):
 
 def test_light_off_its_target_counts_by_how_far_it_is():
     # Three rays; the last two have targets at 2 and 1.
-    offsets = torch.tensor([0, 1, 3, 4])
+    rays = torch.tensor([0, 1, 1, 2])
     middles = torch.tensor([5.0, 2.0, 2.25, 9.0])
     weights, left = torch.tensor([0.9, 0.5, 0.3, 0.7]), torch.tensor([0.1, 0.2, 0.3])
     distances = torch.tensor([2.0, 1.0])
     # First: 0.5 at the point, 0.3 half of the way to "elsewhere", 0.2 passes; second: all is elsewhere.
     expected = [0.3 * 0.5 + 0.2, 0.7 + 0.3]
-    off = reference.depth_loss(weights, left, middles, offsets=offsets, distances=distances)
+    off = reference.depth_loss(weights, left, middles, rays=rays, distances=distances)
     assert off.tolist() == pytest.approx(expected)
     at_targets = reference.depth_loss(
         torch.tensor([0.0, 1.0, 0.0, 1.0]), torch.zeros(3), torch.tensor([5.0, 2.0, 3.0, 1.0]),
-        offsets=offsets, distances=distances,
+        rays=rays, distances=distances,
     )  # fmt: skip
     assert at_targets.tolist() == [0.0, 0.0]
 
@@ -158,7 +158,8 @@ def test_the_gradient_of_light_off_its_target_is_right():
 
     def off(density: torch.Tensor) -> torch.Tensor:
         weights, transmittance = reference.interval_weights(density, lengths, offsets)
-        return reference.depth_loss(weights, transmittance, middles, offsets=offsets, distances=distances)
+        rays = reference.ray_indices(offsets)
+        return reference.depth_loss(weights, transmittance, middles, rays=rays, distances=distances)
 
     assert torch.autograd.gradcheck(off, (density,))
 
@@ -195,7 +196,7 @@ def test_a_known_surface_that_is_nearly_empty_gets_eleven_times_the_gradient():
         offsets, lengths = torch.tensor([0, 3]), torch.full((3,), 0.1, dtype=torch.float64)
         weights, transmittance = reference.interval_weights(log_density.exp(), lengths, offsets)
         middles, distances = torch.tensor([0.5, 1.0, 1.5]).double(), torch.tensor([1.0]).double()
-        off = reference.depth_loss(weights, transmittance, middles, offsets=offsets, distances=distances)
+        off = reference.depth_loss(weights, transmittance, middles, rays=torch.zeros(3).long(), distances=distances)
         loss(off).sum().backward()
         gradients.append(present(log_density.grad)[1].item())
     assert gradients[1] / gradients[0] == pytest.approx(11.0, rel=1e-4)

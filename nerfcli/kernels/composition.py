@@ -97,8 +97,9 @@ class Backend:
             near, far = self._contracted(starts, ends)
             apart = self.operations.distortion(weights, near, far, offsets)
         if targets.distances is not None and len(targets.distances):
-            middles, distances = (starts + ends) / 2, targets.distances
-            off = self._depth_loss(weights, transmittance, middles, samples=samples, distances=distances)
+            off = reference.depth_loss(
+                weights, transmittance, (starts + ends) / 2, rays=index, distances=targets.distances
+            )
         if trace is not None:
             trace("coordinates of samples", samples.coordinates, index)
             if samples.encoded is not None:
@@ -137,7 +138,7 @@ class Backend:
         light = self.operations.ray_termination(density, starts, ends, offsets=offsets, fractions=options.fractions)
         stopped = transmittance <= math.exp(-march.max_optical_depth) * (1 + 1e-5)  # rounding must not hide a stop
         behind = torch.maximum(background, 1.0 - background).amax(-1)  # largest difference from the background's colour
-        left_out = UNSEEN * self._sum_along_rays(torch.where(unseen, weights, 0.0), offsets)
+        left_out = UNSEEN * torch.zeros_like(transmittance).index_add(0, index, torch.where(unseen, weights, 0.0))
         error = left_out + torch.where(stopped, transmittance * behind, 0.0)
         return RaysSeen(colour, light, error, Intervals(density, starts, ends, offsets))
 
@@ -174,16 +175,6 @@ class Backend:
     def _contracted(self, starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
         """Return `reference.contracted_distance` of the ends of intervals."""
         return reference.contracted_distance(starts), reference.contracted_distance(ends)
-
-    def _depth_loss(
-        self, weights: Tensor, transmittance: Tensor, middles: Tensor, *, samples: Samples, distances: Tensor
-    ) -> Tensor:
-        """See `reference.depth_loss`."""
-        return reference.depth_loss(weights, transmittance, middles, offsets=samples.offsets, distances=distances)
-
-    def _sum_along_rays(self, values: Tensor, offsets: Tensor) -> Tensor:
-        """See `reference.sum_along_rays`; for scalars (N,), without gradients."""
-        return reference.sum_along_rays(values, offsets)
 
     def _radiance(self, samples: Samples, directions: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
         """Return densities and colours of samples along directions (R, 3) of rays, with gradients."""

@@ -70,7 +70,7 @@ def composite(
     Returns:
         colour (R, 3), transmittance (R,), weights (N,). A ray without samples has the background's colour and T = 1.
 
-    Differentiable in density, rgb, lengths and background.
+    Differentiable in density and rgb.
     Source: Mildenhall et al. 2020, NeRF, arXiv:2003.08934, eq. 3.
     """
     weights, transmittance = interval_weights(density, lengths, offsets)
@@ -108,9 +108,7 @@ def contracted_distance(distance: Tensor) -> Tensor:
     return torch.where(distance <= 1.0, distance, 2.0 - 1.0 / distance.clamp_min(1.0)) / 2.0
 
 
-def depth_loss(
-    weights: Tensor, transmittance: Tensor, middles: Tensor, *, offsets: Tensor, distances: Tensor
-) -> Tensor:
+def depth_loss(weights: Tensor, transmittance: Tensor, middles: Tensor, *, rays: Tensor, distances: Tensor) -> Tensor:
     """Compute how far from known distances the light of the last K rays is absorbed.
 
     sum_i weight_i min(1, |middle_i - distance| / (c distance)) + transmittance,  c = 0.25
@@ -121,18 +119,16 @@ def depth_loss(
     Args:
         weights, middles: (N,) weights and midpoints of the intervals.
         transmittance: (R,).
-        offsets: (R + 1,).
+        rays: (N,) of the intervals; with them, a GPU's host need not know where the last K begin.
         distances: (K,) > 0, K <= R.
 
     Returns:
         (K,) in [0, 1]; 0 where all light is absorbed at that distance. Differentiable in weights and transmittance.
     """
     first = len(transmittance) - len(distances)
-    of_targets = offsets[first:] - offsets[first]
-    part = slice(int(offsets[first]), None)
-    distance = distances[ray_indices(of_targets)]
-    deviation = ((middles[part] - distance).abs() / (MOST_DEVIATION * distance)).clamp_max(1.0)
-    return sum_along_rays(weights[part] * deviation, of_targets) + transmittance[first:]
+    distance = torch.nn.functional.pad(distances, (first, 0), value=1.0)[rays]
+    deviation = ((middles - distance).abs() / (MOST_DEVIATION * distance)).clamp_max(1.0)
+    return torch.zeros_like(transmittance).index_add(0, rays, weights * deviation)[first:] + transmittance[first:]
 
 
 def scale_gradients(density: Tensor, rgb: Tensor, *, distance: Tensor, near: float) -> None:

@@ -79,14 +79,6 @@ class TritonBackend(Backend):
     def _contracted(self, starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
         return compositing.contracted_distances(starts, ends)
 
-    def _depth_loss(
-        self, weights: Tensor, transmittance: Tensor, middles: Tensor, *, samples: Samples, distances: Tensor
-    ) -> Tensor:
-        return compositing.depth_loss(weights, transmittance, middles, rays=samples.rays, distances=distances)
-
-    def _sum_along_rays(self, values: Tensor, offsets: Tensor) -> Tensor:
-        return rays.sum_along_rays(values[:, None], offsets)[:, 0]
-
     def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
         return networks.radiance(encoded.half(), directions.contiguous(), index, grid.layers, degree=grid.view_degree)
 

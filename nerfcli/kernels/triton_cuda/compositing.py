@@ -10,7 +10,6 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from nerfcli.kernels.reference.compositing import MOST_DEVIATION
 from nerfcli.kernels.triton_cuda.launch import Size, blocks, jit, launch
 from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, load3, own_rays, samples_at, store3
 
@@ -255,15 +254,6 @@ def contracted_distances(starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
         _contract, (blocks(samples, BLOCK),), starts.contiguous(), ends.contiguous(), near, far, samples, BLOCK=BLOCK
     )  # fmt: skip
     return near, far
-
-
-def depth_loss(weights: Tensor, transmittance: Tensor, middles: Tensor, *, rays: Tensor, distances: Tensor) -> Tensor:
-    """See `reference.depth_loss`; with the `rays` (N,) of samples, the host need not know where the last K begin."""
-    first = len(transmittance) - len(distances)
-    distance = torch.nn.functional.pad(distances, (first, 0), value=1.0)[rays]
-    deviation = ((middles - distance).abs() / (MOST_DEVIATION * distance)).clamp_max(1.0)
-    total = torch.zeros_like(transmittance).index_add(0, rays, weights * deviation)
-    return total[first:] + transmittance[first:]
 
 
 def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> Tensor:
