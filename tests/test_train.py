@@ -422,6 +422,7 @@ def test_photos_without_alpha_train_an_unbounded_scene(spheres, tmp_path):
         ({"steps": -3}, "budget must be positive"),
         ({"budget_seconds": None, "steps": 0}, "budget must be positive"),
         ({"downscale": 3}, "invalid downscale factor 3"),
+        ({"log2_rows": 0}, "invalid size of the field: log2-rows 0"),
         ({"field": "gaussians"}, "unknown type of field: 'gaussians'"),
     ],
 )

@@ -83,7 +83,7 @@ class TrainSettings:
     fixed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if not 4 <= (self.log2_rows or 4) <= 24:
+        if self.log2_rows is not None and not 4 <= self.log2_rows <= 24:
             raise UserError(f"invalid size of the field: log2-rows {self.log2_rows}", "it must be between 4 and 24")
         if self.budget_seconds is None and self.steps is None:
             raise UserError(
