@@ -13,7 +13,7 @@ from present import present
 from scipy.ndimage import map_coordinates
 from scipy.special import sph_harm_y
 
-from nerfcli.cameras.rigid import Similarity
+from nerfcli.cameras.rigid import Similarity, rotation_from_quaternion
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings, fourier_features
@@ -283,15 +283,20 @@ def test_the_state_of_the_optimiser_comes_back(field):
         assert torch.equal(value, straight[name]), name
 
 
-def test_every_kind_comes_back_bit_for_bit(field, tmp_path):
-    occupied, marching = torch.rand(4, 4, 4) > 0.5, Marching(near=0.1, far=4.0, shortest_step=0.01, growth=0.0)
-    model = Model(field, occupied, marching, (0.0, 0.0, 0.0), Similarity.identity(), "arbitrary")
+def test_a_model_of_every_kind_comes_back_bit_for_bit(field, tmp_path):
+    frame = Similarity(1 / 3, rotation_from_quaternion(np.array([0.9, 0.1, -0.3, 0.2])), np.array([1.0, -2.0, 0.1]))
+    marching = Marching(near=0.1, far=4.0, shortest_step=0.01, growth=1 / 128)
+    model = Model(field, torch.rand(4, 4, 4) > 0.5, marching, (0.1, 0.2, 1 / 3), frame, "metre")
     save_model(tmp_path / "a.safetensors", model)
-    loaded = load_model(tmp_path / "a.safetensors", "cpu").field
-    assert loaded.settings == field.settings
-    assert type(loaded) is type(field)
+    loaded = load_model(tmp_path / "a.safetensors", "cpu")
+    assert loaded.field.settings == field.settings
+    assert type(loaded.field) is type(field)
     for name, value in field.state_dict().items():
-        assert torch.equal(loaded.state_dict()[name], value), name
+        assert torch.equal(loaded.field.state_dict()[name], value), name
+    assert torch.equal(loaded.occupied, model.occupied)
+    assert (loaded.marching, loaded.background, loaded.unit) == (marching, model.background, "metre")
+    for name, value in vars(frame).items():
+        np.testing.assert_array_equal(getattr(loaded.training_from_scene, name), value)
 
 
 def test_a_kind_of_a_later_version_is_reported():

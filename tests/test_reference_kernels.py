@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from nerfcli import kernels
 from nerfcli.kernels import March, Rays, reference
 from nerfcli.kernels.contraction import cube_widths
-from nerfcli.training.open_cells import training_points, uncontract
+from nerfcli.training.open_cells import training_points
 
 
 @given(seed=st.integers(0, 2**32 - 1), cut=st.integers(0, 6), at=st.floats(0.01, 0.99))
@@ -95,8 +95,6 @@ def test_contraction_round_trip(seed, log_radius):
     g = torch.Generator().manual_seed(seed)
     point = torch.nn.functional.normalize(torch.randn(1, 3, generator=g, dtype=torch.float64), dim=-1)
     point = point * 10**log_radius
-    back = uncontract(kernels.contract(point))
-    torch.testing.assert_close(back, point, rtol=1e-12 * max(1.0, 10**log_radius), atol=0)
     for contraction in kernels.CONTRACTIONS:
         again = training_points(kernels.grid_coordinates(point, contraction), contraction)
         torch.testing.assert_close(again, point, rtol=1e-11 * max(1.0, 10**log_radius), atol=1e-15)
