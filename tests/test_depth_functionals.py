@@ -137,7 +137,7 @@ def test_light_that_passes_counts_at_the_background():
     """Points at 1, 2 and 3 that stop 1/2, 1/4 and 3/16 of the light, 5/3 away in the mean: the rest, 1/16, ends at the
     background."""
     mean, left = (torch.tensor([value], dtype=torch.float64) for value in (5 / 3, 1 / 16))
-    ends = RayTermination(1 - left, left, mean, mean, mean, mean, mean.new_empty(1, 0))
+    ends = RayTermination(1 - left, left, mean, mean, mean, mean.new_empty(1, 0))
     means = [("moment", 4.0, 25 / 16), ("background", 4.0, 29 / 16), ("background", 100.0, 7.8125)]
     for convention, far, wanted in means:
         request = DepthRequest(convention, "ray", background_distance=far)

@@ -164,7 +164,6 @@ class RayTermination(NamedTuple):
     mean: Tensor
     spread: Tensor
     peak: Tensor
-    peak_weight: Tensor
     quantiles: Tensor
 
 

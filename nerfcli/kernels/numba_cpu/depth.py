@@ -112,6 +112,5 @@ def ray_termination_of(sums: np.ndarray, quantiles: np.ndarray, fractions: tuple
         mean=torch.where(seen, mean, torch.nan).float(),
         spread=torch.where(seen, spread, torch.nan).float(),
         peak=torch.where(largest > 0.0, peak, torch.nan).float(),
-        peak_weight=largest.float(),
         quantiles=torch.from_numpy(quantiles[:, back]),
     )

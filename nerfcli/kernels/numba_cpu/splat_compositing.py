@@ -302,8 +302,8 @@ def depths(
 
     Args:
         fractions: (F,) of light.
-        out: (H * W, 6 + F) float32, written: opacity, transmittance, mean, standard deviation, distance of the heaviest
-            Gaussian, its weight, and the distances by which the fractions have ended; NaN where undefined.
+        out: (H * W, 5 + F) float32, written: opacity, transmittance, mean, standard deviation, distance of the heaviest
+            Gaussian, and the distances by which the fractions have ended; NaN where undefined.
     """
     across, tiles = (width + TILE - 1) // TILE, len(starts) - 1
     for thread in numba.prange(threads):
@@ -313,7 +313,7 @@ def depths(
                 for x in range(x0, min(x0 + TILE, width)):
                     row = out[y * width + x]
                     for k in range(len(fractions)):
-                        row[6 + k] = np.nan
+                        row[5 + k] = np.nan
                     t, total, square, peak, largest, origin = 1.0, 0.0, 0.0, np.nan, 0.0, 0.0
                     for entry in range(starts[tile], starts[tile + 1]):
                         i = entries[entry]
@@ -334,11 +334,11 @@ def depths(
                             peak, largest = f[9], weight
                         t -= weight
                         for k in range(len(fractions)):
-                            if t <= 1.0 - fractions[k] and np.isnan(row[6 + k]):
-                                row[6 + k] = f[9]
+                            if t <= 1.0 - fractions[k] and np.isnan(row[5 + k]):
+                                row[5 + k] = f[9]
                         if t <= OPAQUE:
                             break
-                    row[0], row[1], row[4], row[5] = 1.0 - t, t, peak, largest
+                    row[0], row[1], row[4] = 1.0 - t, t, peak
                     row[2], row[3] = np.nan, np.nan
                     if t < 1.0:
                         mean = total / (1.0 - t)

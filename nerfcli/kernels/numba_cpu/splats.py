@@ -90,14 +90,13 @@ def render_splats(rows: np.ndarray, view: SplatView, background: np.ndarray) -> 
 def splat_depths(picture: SplatPicture, fractions: tuple[float, ...]) -> RayTermination:
     """Return where the light of each pixel ends, row by row, each Gaussian at its distance; see `ray_termination`."""
     height, width = picture.transmittance.shape
-    columns = np.empty((height * width, 6 + len(fractions)), np.float32)
+    columns = np.empty((height * width, 5 + len(fractions)), np.float32)
     splat_compositing.depths(
         picture.starts, picture.entries, picture.footprints, picture.boxes, np.array(fractions), height, width, columns,
         use_threads(),
     )  # fmt: skip
     values = torch.from_numpy(columns)
-    opacity, transmittance, mean, spread, peak, largest = values[:, :6].unbind(-1)
-    return RayTermination(opacity, transmittance, mean, spread, peak, largest, values[:, 6:])
+    return RayTermination(*values[:, :5].unbind(-1), quantiles=values[:, 5:])
 
 
 def step_splats(

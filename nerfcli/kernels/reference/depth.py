@@ -84,7 +84,8 @@ def max_weight(weights: Tensor, means: Tensor, offsets: Tensor) -> Tensor:
     The only result that depends on how the ray was cut into intervals.
     """
     rays, nothing = ray_indices(offsets), means.new_full((len(offsets) - 1,), torch.inf)
-    heaviest = (weights == _largest(weights, offsets)[rays]) & (weights > 0)
+    largest = weights.new_zeros(len(nothing)).scatter_reduce(0, rays, weights, "amax")
+    heaviest = (weights == largest[rays]) & (weights > 0)
     nearest = nothing.scatter_reduce(0, rays, torch.where(heaviest, means, torch.inf), "amin")
     return torch.where(nearest.isinf(), torch.nan, nearest)
 
@@ -128,8 +129,7 @@ def ray_termination(
 
     Returns:
         opacity (R,), transmittance (R,); mean (R,) distance of the absorbed light, and its standard deviation `spread`
-        (R,); peak (R,): `max_weight`, and peak_weight (R,): that weight, 0 without samples; quantiles
-        (R, len(fractions)). Undefined values are NaN, and no others.
+        (R,); peak (R,): `max_weight`; quantiles (R, len(fractions)). Undefined values are NaN, and no others.
 
     Opacity and transmittance keep full precision where they are small.
     """
@@ -140,9 +140,4 @@ def ray_termination(
     columns = [quantile(density, starts, ends, offsets=offsets, fraction=fraction) for fraction in fractions]
     quantiles = torch.stack(columns, dim=-1) if columns else density.new_empty(len(offsets) - 1, 0)
     peak = max_weight(weights, starts + lengths * mean_fraction(density * lengths), offsets)
-    return RayTermination(total, transmittance, mean, width, peak, _largest(weights, offsets), quantiles)
-
-
-def _largest(weights: Tensor, offsets: Tensor) -> Tensor:
-    """Return the largest weight of each ray; 0 for a ray without samples."""
-    return weights.new_zeros(len(offsets) - 1).scatter_reduce(0, ray_indices(offsets), weights, "amax")
+    return RayTermination(total, transmittance, mean, width, peak, quantiles)

@@ -48,7 +48,7 @@ def _variance_fraction(x, alpha):
 @jit
 def _ray_termination(
     density, starts, ends, offsets, targets, weights, opacity, transmittance,
-    mean, spread, at_peak, largest, quantiles, rays, FRACTIONS: tl.constexpr,
+    mean, spread, at_peak, quantiles, rays, FRACTIONS: tl.constexpr,
     RAYS: tl.constexpr, STEPS: tl.constexpr,
 ):  # fmt: skip
     ray, there, first, last, longest = own_rays(offsets, rays, RAYS)
@@ -103,7 +103,6 @@ def _ray_termination(
     tl.store(mean + ray, tl.where(ended, start + inside + middle, undefined), mask=there)
     tl.store(spread + ray, tl.where(ended, tl.sqrt(squares / mass), undefined), mask=there)
     tl.store(at_peak + ray, tl.where(ended, start + inside, undefined), mask=there)
-    tl.store(largest + ray, most, mask=there)
     for fraction in range(FRACTIONS):
         target = tl.load(targets + fraction)
         depth = tl.zeros([RAYS], tl.float32)
@@ -137,7 +136,7 @@ def ray_termination(
     density, starts, ends = (x.detach().contiguous() for x in (density, starts, ends))
     rays, device = len(offsets) - 1, density.device
     targets = device_floats(tuple(-math.log1p(-fraction) for fraction in fractions) or (0.0,), device)
-    columns = [torch.empty(rays, device=device) for _ in range(6)]
+    columns = [torch.empty(rays, device=device) for _ in range(5)]
     quantiles = torch.empty(rays, len(fractions), device=device)
     launch(
         _ray_termination, blocks_of(rays), density, starts, ends, offsets, targets, torch.empty_like(density), *columns,
