@@ -13,38 +13,26 @@ from nerfcli.kernels.numba_cpu.threads import use_threads
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _count(walk: Any, counts: Any) -> None:
-    """Count the samples of each ray."""
-    intervals = walk.edges.shape[0] - 2 - CHUNK
-    for ray in numba.prange(counts.shape[0]):
-        places, cells = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32)
-        count = 0
-        for first in range(0, intervals, CHUNK):
-            look_ahead(walk, ray, first, places, cells)
-            for i in range(min(CHUNK, intervals - first)):
-                if cells[i] >= 0 and walk.occupied[cells[i]]:
-                    count += 1
-        counts[ray] = count
-
-
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _write(walk: Any, offsets: Any, starts: Any, ends: Any, coordinates: Any) -> None:
-    """Write the samples of each ray, from its offset on."""
+def _samples(walk: Any, offsets: Any, spans: Any, coordinates: Any) -> None:
+    """Write the samples of each ray from its offset on; without room for them, write their number behind the offset."""
     intervals = walk.edges.shape[0] - 2 - CHUNK
     for ray in numba.prange(offsets.shape[0] - 1):
         places, cells = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32)
-        at = offsets[ray]
+        at = offsets[ray] if spans is not None else 0  # decided when this is compiled
         for first in range(0, intervals, CHUNK):
-            if at == offsets[ray + 1]:
+            if spans is not None and at == offsets[ray + 1]:
                 break
             look_ahead(walk, ray, first, places, cells)
             for i in range(min(CHUNK, intervals - first)):
                 if cells[i] >= 0 and walk.occupied[cells[i]]:
-                    starts[at] = cut(walk.edges, walk.jitter[ray], first + i)
-                    ends[at] = cut(walk.edges, walk.jitter[ray], first + i + 1)
-                    for axis in range(3):
-                        coordinates[at, axis] = places[axis * CHUNK + i]
+                    if spans is not None:
+                        spans[0, at] = cut(walk.edges, walk.jitter[ray], first + i)
+                        spans[1, at] = cut(walk.edges, walk.jitter[ray], first + i + 1)
+                        for axis in range(3):
+                            coordinates[at, axis] = places[axis * CHUNK + i]
                     at += 1
+        if spans is None:
+            offsets[ray + 1] = at
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
@@ -73,10 +61,9 @@ def keep_largest(cells: Tensor, coordinates: Tensor, values: Tensor) -> None:
 def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """See `reference.occupied_samples`; float32 on the CPU."""
     use_threads()
-    walk = walk_of(rays, along)
-    counts = np.zeros(len(rays.origins), np.int64)
-    _count(walk, counts)
-    offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
+    walk, offsets = walk_of(rays, along), np.zeros(len(rays.origins) + 1, np.int64)
+    _samples(walk, offsets, None, None)
+    offsets = offsets.cumsum()
     spans, coordinates = torch.empty(2, int(offsets[-1])), torch.empty(int(offsets[-1]), 3)
-    _write(walk, offsets, spans[0].numpy(), spans[1].numpy(), coordinates.numpy())
+    _samples(walk, offsets, spans.numpy(), coordinates.numpy())
     return spans[0], spans[1], coordinates, torch.from_numpy(offsets)
