@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.poses.input.pairs import all_pairs
-from nerfcli.poses.input.settings import FULL_SIZE
+from nerfcli.poses.input.settings import LARGEST_PX
 
 Array = NDArray[np.float64]
 
@@ -381,7 +381,7 @@ def job_of(work: Path, files: tuple[str, ...], groups: tuple[CameraGroup, ...], 
         "pairs": (),
         "neighbours": 0,
     }
-    usual |= {"max_image_size": FULL_SIZE, "max_features": 8192, "seed": 0, "threads": 1}
+    usual |= {"max_image_size": LARGEST_PX, "max_features": 8192, "seed": 0, "threads": 1}
     return Job(folder=str(work), files=files, groups=groups, **usual | others)
 
 

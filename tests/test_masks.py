@@ -134,9 +134,8 @@ def test_photos_without_a_mask_are_named(photos, masks, tmp_path):
     ]
     assert [mask.used_fraction for mask in result] == [1, 1, 0, 1]
     assert [bool(mask.key) for mask in result] == [False, True, True, False]
-    assert sorted(path.name for path in (tmp_path / "work").iterdir()) == [f"{n:05d}.png.png" for n in range(4)]
-    white = [read_image(tmp_path / "work" / f"{number:05d}.png.png").min() for number in range(4)]
-    assert white == [255, 255, 0, 255]
+    laid = {path.name: read_image(path).max() for path in (tmp_path / "work").iterdir()}
+    assert laid == {"00001.png.png": 255, "00002.png.png": 0}
 
 
 def test_a_folder_without_masks_is_reported_before_the_work(photos, masks):
@@ -177,7 +176,7 @@ def job_for(photos: Photos, masks: tuple[WorkMask, ...], folder: Path) -> Job:
 
 
 def test_features_lie_where_the_mask_is_white(photos, masks, tmp_path):
-    """pycolmap's own keypoints: none in the black half, some in the white one; a photo without mask has both."""
+    """A masked photo has those features of the whole photo that are in its white half; one without a mask has all."""
     half = np.zeros((HEIGHT, WIDTH), np.uint8)
     half[:, WIDTH // 2 :] = 255
     write_png(masks / "p 0.png", half)
@@ -185,12 +184,20 @@ def test_features_lie_where_the_mask_is_white(photos, masks, tmp_path):
     job = job_for(photos, laid_out(photos, masks, work / "masks")[0], work)
     write_job(tmp_path / "job.json", job)
     assert read_job(tmp_path / "job.json") == job
-    extract(job, lambda stage, done, total: None)
-    with pycolmap.Database.open(str(job.database)) as database:
-        masked, free = (database.read_keypoints(image_id)[:, 0] for image_id in (1, 2))
-    assert len(masked) > 10
-    assert masked.min() >= WIDTH / 2
-    assert free.min() < WIDTH / 2 < free.max()
+    whole = job_for(photos, (), tmp_path / "whole" / "work")
+    found = []
+    for searched in (replace(job, max_features=800), replace(whole, max_features=800)):
+        extract(searched, lambda stage, done, total: None)
+        with pycolmap.Database.open(str(searched.database)) as database:
+            found.append([database.read_keypoints(image_id) for image_id in searched.image_ids])
+    (masked, *others), (all_of_it, *same) = found
+    assert masked[:, 0].min() >= WIDTH / 2 - 0.5
+    assert all_of_it[:, 0].min() < WIDTH / 2
+    clearly = [found[found[:, 0] > WIDTH / 2 + 0.5] for found in (masked, all_of_it)]
+    assert len(clearly[0]) > 50
+    np.testing.assert_array_equal(*clearly)
+    for one, other in zip(others, same, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_small_part_gets_as_many_features_as_a_whole_photo_would(masks, tmp_path):

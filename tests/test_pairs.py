@@ -319,20 +319,6 @@ def test_the_mapper_takes_longer_for_later_photos(seconds_per_photo: float):
         assert outlook.left(now, "map", done, 300) == pytest.approx(whole - now)
 
 
-def test_a_second_search_for_features_adds_to_what_is_left_and_takes_nothing_from_the_share():
-    """Half of the photos are searched again, at three times the cost: 10 s of searching become 25 s."""
-    outlook = Outlook({"extract": 10.0, "match": 8.0, "map": 2.0})
-    assert outlook.whole(0, 10, "extract", 10) == (pytest.approx(0.5), pytest.approx(10.0))
-    assert outlook.at(10, "enlarge", 0, 5) == (pytest.approx(0.5), pytest.approx(15.0 + 10.0))
-    assert outlook.at(22, "enlarge", 4, 5) == (pytest.approx(22.0 / 35.0), pytest.approx(3.0 + 10.0))
-    # Two photos are searched once more, each as long as the first time.
-    outlook.at(25, "enlarge", 5, 5)
-    assert outlook.left(25, "faint", 0, 2) == pytest.approx(2.0 + 10.0)
-    # Later stages scale with the speed of the machine, not with the number of photos that were searched twice.
-    outlook.at(27, "faint", 2, 2)
-    assert outlook.left(27, "match", 0, 45) == pytest.approx(10.0)
-
-
 def test_merging_and_locating_add_to_what_is_left_and_take_nothing_from_the_share():
     """Merging takes a fifth of the planned mapping time on a machine as fast as planned, and precedes the checks."""
     outlook = Outlook({"map": 100.0, "check": 20.0})

@@ -240,7 +240,7 @@ def test_a_damaged_stage_is_none(tmp_path: Path, text: str):
 def test_damaged_stages_are_done_again(photos: Path, whole: Path, again: Path):
     """Each is damaged in another way: cut off, of the wrong type, with other content, not text."""
     stages = sorted(path for path in (again / "work").glob("*.json"))
-    assert {path.stem for path in stages} >= {"features", "geometries", "matches", "photos", "searches"}
+    assert {path.stem for path in stages} >= {"features", "geometries", "matches", "photos"}
     for number, path in enumerate(stages):
         content = json.loads(path.read_text())
         wrong = (path.read_text()[:20], "[1, 2]", json.dumps(content | {"content": 7}), "\udcff\udc80")[number % 4]

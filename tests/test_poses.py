@@ -23,7 +23,7 @@ from nerfcli.poses.report import PosesReport
 from nerfcli.poses.structure_from_motion import estimate_poses
 from nerfcli.poses.workspace import hash_inputs, is_same_scene
 
-FAST = PoseSettings(max_features=500, max_image_size=384, threads=2)
+FAST = PoseSettings(max_features=1000, max_image_size=384, threads=2)
 
 
 @dataclass(frozen=True)
@@ -60,16 +60,16 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> Solved:
 
 
 def test_poses_agree_with_the_truth(solved: Solved):
-    """Synthetic truth. The cameras are 4 units from the corner; the observed errors are 0.002 and 0.09 degrees."""
+    """Synthetic truth. The cameras are 4 units from the corner; the observed errors are 0.0005 and 0.04 degrees."""
     model = solved.model
     estimated = [model.find_image_with_name(name) for name in NAMES]
     centres = np.array([image.projection_center() for image in estimated])
     truth_from_found = align(centres, CENTRES)
-    assert np.linalg.norm(truth_from_found.apply(centres) - CENTRES, axis=1).max() < 0.008
+    assert np.linalg.norm(truth_from_found.apply(centres) - CENTRES, axis=1).max() < 0.002
     for image, centre in zip(estimated, CENTRES, strict=True):
         found = image.cam_from_world().rotation.matrix() @ truth_from_found.rotation.T
         cosine = (np.trace(found @ cam_from_world(centre)[:, :3].T) - 1) / 2
-        assert np.degrees(np.arccos(min(cosine, 1.0))) < 0.3
+        assert np.degrees(np.arccos(min(cosine, 1.0))) < 0.15
 
 
 def test_intrinsics_agree_with_the_truth_and_are_shared_by_size(solved: Solved):
@@ -131,20 +131,17 @@ def test_the_report_file_has_the_promised_keys(solved: Solved):
     assert report["verdict"]["accepted"]
     assert report["parts"] == [7]
     assert report["models"][0] == report["registered"] == 7
-    assert report["settings"]["max_features"] == 500
-    assert report["search"] == {"max_image_size": 384, "max_features": 500}
+    assert report["settings"]["max_features"] == 1000
+    assert report["search"] == {"max_image_size": 384, "max_features": 1000}
     assert report["versions"]["pycolmap"] == pycolmap.__version__
     assert report["matching"] == {"rule": "retrieval", "pairs": 25, **hash_inputs(solved.photos, FAST)}
 
 
 def test_progress_goes_through_all_stages(solved: Solved):
     stages = list(dict.fromkeys(stage for stage, _, _ in solved.stages))
-    searches = ["extract", "enlarge", "faint", "faint-enlarged"]
-    assert stages == ["read", *searches, "features", "pair", "match", "matches", "map", "check", "stabilise"]
+    assert stages == ["read", "extract", "features", "pair", "match", "matches", "map", "check", "stabilise"]
     last = {stage: (done, total) for stage, done, total in solved.stages}
     assert last["extract"] == (8, 8)
-    assert last["enlarge"][0] == last["enlarge"][1] > 0
-    assert last["faint"] == last["faint-enlarged"] == (1, 1)  # the blank photo
     assert last["match"] == (25, 25)  # the blank photo is matched with four others
 
 

@@ -463,7 +463,6 @@ class TestPoses:
         """Like a camera that moves around the object: the background outside the true masks is made grey."""
         photos = np.where(capture.masks[..., None], capture.photos, np.uint8(128))
         write(replace(capture, photos=photos), tmp_path)
-        # Half of 400 features are found without a search of enlarged pictures.
         report, notes = solved(tmp_path / "images", tmp_path / "scene", max_features=400)
         assert report["moving_foreground"] is None
         assert not (tmp_path / "scene" / "masks").exists()

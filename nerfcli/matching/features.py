@@ -3,6 +3,7 @@
 No cameras are needed. Used by training, `doctor` and `convert --detect`.
 """
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -22,13 +23,15 @@ class Features:
 
     Args:
         pixels: (N, 2) in the photo, pixel centres at 0.5.
-        sizes: (N,) float32, diameters of the features, in pixels of the reduced photo.
+        sizes: (N,) float32, diameters of the features, in pixels of the photo.
+        angles: (N,) float32, orientations in radians, clockwise from the x axis.
         responses: (N,) float32, contrast.
         descriptors: (N, 128) float32, whole numbers from 0 to 255.
     """
 
     pixels: np.ndarray
     sizes: np.ndarray
+    angles: np.ndarray
     responses: np.ndarray
     descriptors: np.ndarray
 
@@ -41,29 +44,49 @@ class Matches:
     pixels: tuple[np.ndarray, np.ndarray]
 
 
-def find_features(grey: np.ndarray, *, longer_side_px: int, most: int, used: np.ndarray | None = None) -> Features:
+def find_features(
+    grey: np.ndarray,
+    *,
+    longer_side_px: int,
+    most: int,
+    used: np.ndarray | None = None,
+    contrast: float = 0.04,
+    enlargement: float = 1.0,
+) -> Features:
     """Find SIFT features in a grey photo (H, W) uint8, reduced until its longer side is at most `longer_side_px`.
 
     Args:
         most: number of features to keep, by contrast; a few more at equal contrast.
         used: (H, W) bool, where to look for features; None for everywhere.
+        contrast: that a feature needs, as OpenCV counts it: three times the difference of two blurred pictures, of 1
+            between black and white.
+        enlargement: factor, at least 1, by which the reduced photo is enlarged to find smaller features.
     """
     height, width = grey.shape
-    small = reduced(grey, longer_side_px)
-    size = (small.shape[1], small.shape[0])
-    mask = None if used is None else cv2.resize(used.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    searched = reduced(grey, longer_side_px)
+    if enlargement > 1:
+        searched = cv2.resize(searched, None, fx=enlargement, fy=enlargement, interpolation=cv2.INTER_CUBIC)
+    size = (searched.shape[1], searched.shape[0])
+    mask, of_all = None, most
+    if used is not None:
+        mask = cv2.resize(used.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        # OpenCV chooses features before it applies the mask; if all were chosen, most descriptors would be in vain.
+        of_all = math.ceil(most / max(mask.mean(), 1 / 16))
     # Without precise upscaling, OpenCV's keypoints are off by a quarter of a pixel.
-    sift = cv2.SIFT.create(nfeatures=most, enable_precise_upscale=True)
-    keypoints, descriptors = sift.detectAndCompute(small, mask)
+    sift = cv2.SIFT.create(nfeatures=of_all, contrastThreshold=contrast, enable_precise_upscale=True)
+    keypoints, descriptors = sift.detectAndCompute(searched, mask)
     if descriptors is None:
         keypoints, descriptors = [], np.zeros((0, 128), dtype=np.float32)
     # OpenCV has pixel centres at whole numbers.
     found = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64).reshape(-1, 2) + 0.5
+    responses = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
+    kept = responses >= (-np.partition(-responses, most)[most] if len(responses) > most else 0)
     return Features(
-        found * (width / size[0], height / size[1]),
-        np.array([keypoint.size for keypoint in keypoints], dtype=np.float32),
-        np.array([keypoint.response for keypoint in keypoints], dtype=np.float32),
-        descriptors,
+        found[kept] * (width / size[0], height / size[1]),
+        np.array([keypoint.size for keypoint in keypoints], dtype=np.float32)[kept] * np.float32(width / size[0]),
+        np.radians([keypoint.angle for keypoint in keypoints], dtype=np.float32)[kept],
+        responses[kept],
+        descriptors[kept],
     )
 
 

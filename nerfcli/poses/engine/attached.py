@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from nerfcli.errors import several
 from nerfcli.matching.attached import Lens, enlarged, examined, fixed_mask, lens_of, small
 from nerfcli.photos.images import image_size, read_image
 from nerfcli.poses.input.job import Job, Tell, WorkMask
-from nerfcli.poses.input.layout import write_mask, write_no_mask
+from nerfcli.poses.input.layout import write_mask
 
 # A mask is not used if more than this fraction of the matches that move lie in it: it would be of the object.
 MOST_MOVING = 0.02
@@ -53,15 +54,16 @@ def mask_attached(
     masked = several(sum(lens in masks for lens in lenses), "photo")
     tell(f"attached to the camera: {fraction:.1f} % of the pixels of {masked}, where no features are searched for")
     job.mask_folder.mkdir(exist_ok=True)
-    first: dict[Lens, tuple[str, WorkMask]] = {}
+    written: dict[Lens, tuple[Path, WorkMask]] = {}
+    used = []
     for file, lens in zip(job.files, lenses, strict=True):
         path = job.mask_folder / f"{file}.png"
-        if lens in first:
-            shutil.copyfile(job.mask_folder / f"{first[lens][0]}.png", path)
-        else:
-            mask = write_mask(path, ~masks[lens]) if lens in masks else write_no_mask(path, lens[1])
-            first[lens] = file, mask
-    return [first[lens][1] for lens in lenses]
+        if lens in written:
+            shutil.copyfile(written[lens][0], path)
+        elif lens in masks:
+            written[lens] = path, write_mask(path, ~masks[lens])
+        used.append(written[lens][1] if lens in masks else WorkMask())
+    return used
 
 
 def remembered(masks: Sequence[WorkMask]) -> list[Any]:
@@ -71,6 +73,6 @@ def remembered(masks: Sequence[WorkMask]) -> list[Any]:
 
 def recalled(job: Job, masks: Sequence[Any]) -> Job | None:
     """Return the job with the masks that `mask_attached` wrote for it; None if one of their files is missing."""
-    if not all((job.mask_folder / f"{file}.png").is_file() for file in job.files):
-        return None
-    return replace(job, masks=tuple(WorkMask(*mask) for mask in masks))
+    found = tuple(WorkMask(*mask) for mask in masks)
+    paths = [job.mask_folder / f"{file}.png" for file, mask in zip(job.files, found, strict=True) if mask.key]
+    return replace(job, masks=found) if all(path.is_file() for path in paths) else None

@@ -22,7 +22,7 @@ from nerfcli.poses.engine.mapping import MappedModels, MapperOptions, map_photos
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import ALL_ALIKE_UP_TO, all_pairs
 from nerfcli.poses.input.plan import extraction_seconds, mapping_seconds, matching_seconds
-from nerfcli.poses.input.settings import FULL_SIZE, MOST_FEATURES
+from nerfcli.poses.input.settings import LARGEST_PX, MOST_FEATURES
 from nerfcli.poses.judge.parallax import best_rotation_fit
 from nerfcli.poses.model.intrinsics import FISHEYE_FROM_DEG, field_of_view_deg
 from nerfcli.poses.model.lens_evidence import lenses_of
@@ -303,8 +303,7 @@ def map_with_more_features(attempts: MappingAttempts) -> None:
     else:
         seconds = _MOST_FOR_MORE * (1 - attempts.placed_fraction()) * _search_seconds(without_halving)
         more = _with_larger_pictures(without_halving, seconds)
-        size = "full-size photos" if more.max_image_size == FULL_SIZE else f"photos of {more.max_image_size} pixels"
-        what = f"more features from {size}"
+        what = f"more features from pictures of {more.max_image_size} pixels"
     attempts.job = more
     attempts.announce(what, takes=_search_seconds(more) / _search_seconds(job))
     extract(more, attempts.report)
@@ -318,11 +317,10 @@ def _with_larger_pictures(job: Job, seconds: float) -> Job:
     """Return the job with all pairs, more features, and pictures as large as the CPU seconds allow."""
     more = replace(job, variant="full-size", max_features=MOST_FEATURES, pairs=all_pairs(len(job.files)))
     matching = matching_seconds(len(more.pairs), max_features=more.max_features)
-    full = _search_seconds(replace(more, max_image_size=FULL_SIZE)) - matching
+    full = _search_seconds(replace(more, max_image_size=LARGEST_PX)) - matching
     fraction = min(1.0, max(seconds - matching, 0.0) / full) ** 0.5  # of the longer side: time is proportional to area
-    longest = max(max(group.width, group.height) for group in job.groups)
-    size = FULL_SIZE if fraction == 1 else max(round(fraction * longest), job.max_image_size)
-    return replace(more, max_image_size=size)
+    longest = min(LARGEST_PX, max(max(group.width, group.height) for group in job.groups))
+    return replace(more, max_image_size=max(round(fraction * longest), job.max_image_size))
 
 
 # What follows the first attempt, in this order: each if its reason holds, and time is left.

@@ -1,100 +1,107 @@
-"""Extract features and match pairs with pycolmap, continuing from the existing content of its database."""
+"""Find features of photos, and match pairs with pycolmap, continuing from the existing content of its database."""
 
-import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import partial
 from itertools import repeat
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pycolmap
 
 from nerfcli.errors import duration
-from nerfcli.poses.engine.database import (
-    clear_matches,
-    feature_counts,
-    forget_features,
-    keep_geometries,
-    register_photos,
-)
+from nerfcli.matching.features import Features, find_features
+from nerfcli.photos.images import read_image
+from nerfcli.poses.engine.database import clear_matches, forget_features, keep_geometries, register_photos
 from nerfcli.poses.input.job import Job, Report, WorkMask, read_stage, repeatedly, stage_key, write_stage
-from nerfcli.poses.input.plan import limit_seconds, matching_seconds
+from nerfcli.poses.input.plan import limit_seconds, matching_seconds, searched_at_a_time, searched_pixels
 
 # Most RANSAC trials to verify a pair; pycolmap's 10,000 take twice as long and verify no further pair of 30 matches.
 _MOST_TRIALS = 2000
 # The time limit is checked after this many pairs.
 _PAIRS_PER_CALL = 1024
 # Change these whenever this module would find other features in the same photo, or other matches of the same features.
-_FEATURES_VERSION = "octaves 0, then -1 below half, then 0 and -1 with a quarter of the contrast below an eighth"
-_MATCHES_VERSION = "ratio 0.8, cross-checked"
-
-
-# Contrast that a feature needs, of 1 between black and white.
-_CONTRAST = pycolmap.SiftExtractionOptions().peak_threshold
-
-
-@dataclass(frozen=True)
-class _Search:
-    """One search of photos for features.
-
-    stage: its name in reports of progress. below: a photo is searched if its number of features so far is below this
-    fraction of the requested ones. first_octave: of SIFT, 0 for the picture as it is, -1 for the enlarged one.
-    contrast: that a feature needs.
-    """
-
-    stage: str
-    below: float
-    first_octave: int
-    contrast: float
-
-
-# Searching the enlarged picture, pycolmap's default, takes three times as long. Photos with many features gain nothing
-# from it, since pycolmap keeps the coarsest, and measured poses are no better with more than half of those requested.
-# Photos of dark, blurred or uniform surfaces have hardly any feature with the usual contrast, but match with a quarter.
-_SEARCHES = (
-    _Search("extract", below=math.inf, first_octave=0, contrast=_CONTRAST),
-    _Search("enlarge", below=1 / 2, first_octave=-1, contrast=_CONTRAST),
-    _Search("faint", below=1 / 8, first_octave=0, contrast=_CONTRAST / 4),
-    _Search("faint-enlarged", below=1 / 8, first_octave=-1, contrast=_CONTRAST / 4),
+_FEATURES_VERSION = (
+    "OpenCV, the strongest, enlarged below three quarters, with a quarter of the contrast below an eighth"
 )
+_MATCHES_VERSION = "ratio 0.8, cross-checked"
+# Contrast that a feature needs, see `find_features`. Half of OpenCV's default, as pycolmap asks for.
+_CONTRAST = 0.02
+# A photo with fewer than this fraction of the requested features is searched again, enlarged by this factor, if that is
+# not above the size of the largest searched pictures: frames of small videos have matches in their finest detail.
+_ENLARGED_BELOW, _ENLARGEMENT = 3 / 4, 1.5
+# Photos of dark, blurred or uniform surfaces have hardly any feature with that contrast, but match with a quarter. That
+# is enough where fewer than this fraction of the requested features are found.
+_FAINT_BELOW = 1 / 8
+_SIFT = pycolmap.FeatureExtractorType.SIFT
 
 
 def feature_keys(job: Job) -> dict[str, str]:
     """Return, per photo (by image id, as text for JSON), a hash of everything that its features depend on."""
-    settings = (_FEATURES_VERSION, job.max_image_size, job.max_features, pycolmap.__version__)
+    settings = (_FEATURES_VERSION, job.max_image_size, job.max_features, cv2.__version__)
     contents = [(key, mask.key) for key, mask in zip(job.keys, job.masks or repeat(WorkMask()), strict=False)]
     return {str(i): stage_key(*content, *settings) for i, content in zip(job.image_ids, contents, strict=True)}
 
 
 def extract(job: Job, report: Report) -> None:
-    """Extract SIFT features of every photo that has none yet, with one camera per group.
-
-    All photos are searched once, those with few features again as `_SEARCHES` says.
-    """
+    """Extract SIFT features of every photo that has none yet."""
     register_photos(job)
     keys, stage_path = feature_keys(job), job.stage_file("features")
     there = read_stage(stage_path, _FEATURES_VERSION) or {}
     forget_features(job, [int(image_id) for image_id, key in keys.items() if there.get(image_id) != key])
     # From here on, all features in the database are those of `keys`.
     write_stage(stage_path, _FEATURES_VERSION, keys)
-    last_file = job.stage_file("searches")
-    kept = read_stage(last_file, _FEATURES_VERSION) or {}
-    # The index of the last search of each photo, by number.
-    last = [kept[i][1] if kept.get(i, [""])[0] == keys[i] else 0 for i in map(str, job.image_ids)]
-    for index, search in enumerate(_SEARCHES):
-        if index > 0:
-            counts = feature_counts(job)
-            poor = [n for n in range(len(last)) if last[n] == index - 1 and counts[n] < search.below * job.max_features]
-            # Features are removed before photos are listed for a search: a listed photo with features has had it.
-            forget_features(job, [job.image_ids[number] for number in poor])
-            for number in poor:
-                last[number] = index
-            searched = zip(map(str, job.image_ids), last, strict=True)
-            write_stage(last_file, _FEATURES_VERSION, {i: [keys[i], number] for i, number in searched})
-        due = [number for number, found in enumerate(last) if found == index]
-        if due or index == 0:
-            _extract(job, due, search, watched=due if index > 0 else range(len(last)), report=report)
+    total = len(job.files)
+    largest = max(searched_pixels(job.sizes.values(), max_image_size=job.max_image_size))
+    at_a_time = searched_at_a_time(largest, threads=job.threads)
+    own_threads = cv2.getNumThreads()
+    cv2.setNumThreads(job.threads // at_a_time)
+    try:
+        with pycolmap.Database.open(job.database) as database, ThreadPoolExecutor(at_a_time) as pool:
+            missing = [n for n, image_id in enumerate(job.image_ids) if not database.exists_descriptors(image_id)]
+            report("extract", total - len(missing), total)
+            found = pool.map(partial(_search, job), missing)
+            for done, (number, features) in enumerate(zip(missing, found, strict=True), start=total - len(missing) + 1):
+                _write(database, job.image_ids[number], features)
+                report("extract", done, total)
+    finally:
+        cv2.setNumThreads(own_threads)
+
+
+def _search(job: Job, number: int) -> Features:
+    """Find the features of one photo."""
+    pixels = np.ascontiguousarray(read_image(job.photos / job.files[number])[..., :3])
+    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    used = _used_pixels(job, number)
+    search = partial(find_features, grey, longer_side_px=job.max_image_size, most=job.max_features, used=used)
+    features = search(contrast=_CONTRAST)
+    enlargement = min(_ENLARGEMENT, job.max_image_size / max(grey.shape))
+    if len(features.pixels) < _ENLARGED_BELOW * job.max_features and enlargement > 1:
+        search = partial(search, enlargement=enlargement)
+        features = search(contrast=_CONTRAST)
+    faint = len(features.pixels) < _FAINT_BELOW * job.max_features
+    return search(contrast=_CONTRAST / 4) if faint else features
+
+
+def _used_pixels(job: Job, number: int) -> np.ndarray | None:
+    if not job.masks or not job.masks[number].key:
+        return None
+    mask = cv2.imread(str(job.mask_folder / f"{job.files[number]}.png"), cv2.IMREAD_GRAYSCALE)
+    return mask > 0
+
+
+def _write(database: pycolmap.Database, image_id: int, features: Features) -> None:
+    """Write features with descriptors normalised as pycolmap's matcher expects them: RootSIFT, Arandjelovic 2012."""
+    sums = features.descriptors.sum(axis=1, keepdims=True)
+    root = np.sqrt(features.descriptors / np.maximum(sums, 1))
+    descriptors = pycolmap.FeatureDescriptors(_SIFT, np.round(512 * root).clip(0, 255).astype(np.uint8))
+    rows = np.column_stack([features.pixels, features.sizes / 2, features.angles]).astype(np.float32)
+    with pycolmap.DatabaseTransaction(database):
+        database.write_keypoints(image_id, rows)
+        database.write_descriptors(image_id, descriptors)
 
 
 def start_matching(job: Job, pairs: Sequence[tuple[int, int]]) -> None:
@@ -150,48 +157,6 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
                 return None
         left = len(pairs) - done()  # counted here, since the watching thread has ended
         return f"matching: {left} of {len(pairs)} pairs are not matched after {duration(most)}"
-
-
-def _extract(job: Job, numbers: Iterable[int], search: _Search, *, watched: Sequence[int], report: Report) -> None:
-    """Extract features of photos that have none, and report how many of the photos `watched` have some."""
-    sift = {"first_octave": search.first_octave, "peak_threshold": search.contrast}
-    options = pycolmap.FeatureExtractionOptions(
-        max_image_size=job.max_image_size, num_threads=job.threads, use_gpu=False, sift=sift
-    )
-    reader = pycolmap.ImageReaderOptions(mask_path=job.mask_folder if job.masks else "")
-    with pycolmap.Database.open(job.database) as database:
-        pending = {job.image_ids[number] for number in watched}
-
-        def done() -> int:
-            pending.difference_update([image_id for image_id in pending if database.exists_descriptors(image_id)])
-            return len(watched) - len(pending)
-
-        with _watched(search.stage, done, len(watched), report):
-            for limit, members in _by_limit(job, numbers).items():
-                options.sift.max_num_features = limit
-                pycolmap.extract_features(
-                    job.database,
-                    job.photos,
-                    image_names=members,
-                    reader_options=reader,
-                    extraction_options=options,
-                    device=pycolmap.Device.cpu,
-                )
-
-
-def _by_limit(job: Job, numbers: Iterable[int]) -> dict[int, list[str]]:
-    """Group files by the feature limit of the whole picture that leaves enough features inside the mask.
-
-    pycolmap chooses features before it applies the mask. The limit doubles each time the used fraction of the picture
-    halves.
-    """
-    limits: dict[int, list[str]] = {}
-    for number in numbers:
-        fraction = job.masks[number].used_fraction if job.masks else 1.0
-        # A larger factor would only add fine features at noise level.
-        factor = min(8, 2 ** int(math.log2(1 / fraction))) if fraction > 0 else 1
-        limits.setdefault(job.max_features * factor, []).append(job.files[number])
-    return limits
 
 
 @contextmanager

@@ -113,8 +113,5 @@ def _clear_matches(distances: np.ndarray) -> np.ndarray:
 
 def _coarsest(database: pycolmap.Database, image_id: int, most: int) -> np.ndarray:
     """Return the descriptors (N, 128) of the largest-scale features of a photo, the largest first."""
-    if not database.num_keypoints_for_image(image_id):
-        return np.zeros((0, 128), np.uint8)
-    a, b, c, d = database.read_keypoints(image_id)[:, 2:6].T  # the affine shape, row by row
-    order = np.argsort(-np.abs(a * d - b * c), kind="stable")[:most]
+    order = np.argsort(-database.read_keypoints(image_id)[:, 2], kind="stable")[:most]
     return database.read_descriptors(image_id).data[order]

@@ -27,7 +27,7 @@ from nerfcli.poses.engine.attached import mask_attached, recalled, remembered
 from nerfcli.poses.engine.features import feature_keys
 from nerfcli.poses.input import still_background as still
 from nerfcli.poses.input.job import Job, Tell, WorkMask, file_key, read_stage, stage_key, write_stage
-from nerfcli.poses.input.layout import write_mask, write_no_mask
+from nerfcli.poses.input.layout import write_mask
 
 # Features are searched in photos reduced to this longer side, and so many are kept.
 _SIDE_PX = 1000
@@ -125,7 +125,7 @@ def recall_masks(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
         target = job.mask_folder / f"{file}.png"
         target.parent.mkdir(exist_ok=True)
         if name in unmasked:
-            masks.append(write_no_mask(target, image_size(job.photos / file)))
+            masks.append(WorkMask())
             continue
         try:
             masks.append(write_mask(target, read_mask(mask, photo) > 0))
@@ -346,7 +346,7 @@ def _edited_masks(job: Job, tell: Tell) -> set[str]:
 
 
 def _write_masks(job: Job, masks: Sequence[np.ndarray | None], edited: Collection[str]) -> tuple[WorkMask, ...]:
-    """Write a mask of each photo for pycolmap, and those that were found for the user, except edited ones."""
+    """Write the masks for the search for features, and those that were found for the user, except edited ones."""
     job.mask_folder.mkdir(exist_ok=True)
     stage = Path(job.folder) / _WRITTEN
     made = [name for name, mask in zip(job.names, masks, strict=True) if mask is not None and name not in edited]
@@ -355,18 +355,17 @@ def _write_masks(job: Job, masks: Sequence[np.ndarray | None], edited: Collectio
     write_stage(stage, _WRITTEN_VERSION, written)
     laid_out = []
     for name, file, key, mask in zip(job.names, job.files, job.keys, masks, strict=True):
-        size, target = image_size(job.photos / file), job.mask_folder / f"{file}.png"
-        path = scene_masks(job) / f"{name}.png"
+        path, target = scene_masks(job) / f"{name}.png", job.mask_folder / f"{file}.png"
         if name in edited:
             laid_out.append(write_mask(target, read_mask(path, Path(job.originals) / name) > 0))
             continue
         if mask is None:
-            laid_out.append(write_no_mask(target, size))
+            laid_out.append(WorkMask())
             photo_key, mask_key = written.pop(name, (None, None))
             if path.is_file() and (photo_key in ("", key) or file_key(path) == mask_key):  # training would use it
                 path.unlink()
             continue
-        mask = still.enlarged(mask, size)
+        mask = still.enlarged(mask, image_size(job.photos / file))
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(mask).save(path)
         written[name] = [key, file_key(path)]

@@ -85,7 +85,7 @@ def _is_plain(path: Path, photo: Photo) -> bool:
 def lay_out_masks(
     photos: Photos, files: Sequence[str], masks: Path, *, folder: Path, notify: Callable[[str], None]
 ) -> tuple[WorkMask, ...]:
-    """Write a mask for each photo, upright, for pycolmap: 00000.jpg.png for the photo 00000.jpg, black where not used.
+    """Write the mask of each photo that has one, upright: 00000.jpg.png for the photo 00000.jpg, black where not used.
 
     `files` are the photos' names below the worker's folder of photos, `masks` is the user's folder.
 
@@ -96,11 +96,11 @@ def lay_out_masks(
     folder.mkdir(parents=True, exist_ok=True)
 
     def one(index: int) -> WorkMask | str:
-        path, photo = found[index], photos.photos[index]
+        path = found[index]
         if path is None:
-            return write_no_mask(folder / f"{files[index]}.png", (photo.width, photo.height))
+            return WorkMask()
         try:
-            used = read_mask(path, photos.folder / photo.name) > 0
+            used = read_mask(path, photos.folder / photos.names[index]) > 0
         except UserError as error:
             return error.message
         return write_mask(folder / f"{files[index]}.png", used)
@@ -122,15 +122,9 @@ def lay_out_masks(
 
 
 def write_mask(path: Path, used: np.ndarray) -> WorkMask:
-    """Write a mask for pycolmap from the used pixels of the upright photo, bool (height, width)."""
+    """Write a mask from the used pixels of the upright photo, bool (height, width)."""
     Image.fromarray(used).save(path)
     return WorkMask(stage_key(used.shape, np.packbits(used).tobytes().hex()), float(used.mean()))
-
-
-def write_no_mask(path: Path, size: tuple[int, int]) -> WorkMask:
-    """Write a white mask for a photo of (width, height), since pycolmap leaves out a photo whose mask is missing."""
-    Image.new("1", size, 1).save(path)
-    return WorkMask()
 
 
 def find_masks(photos: Photos, masks: Path) -> list[Path | None]:

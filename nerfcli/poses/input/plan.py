@@ -27,9 +27,6 @@ class Stage(NamedTuple):
 STAGES = {
     "read": Stage("reading photos", "photos read"),
     "extract": Stage("finding features", "photos, features", "features"),
-    "enlarge": Stage("extracting finer features", "photos, finer features"),
-    "faint": Stage("extracting faint features", "photos, faint features"),
-    "faint-enlarged": Stage("extracting faint features at double size", "photos, faint finer features"),
     "features": Stage("counting features", "features per photo"),
     "pair": Stage("choosing pairs", "photos, finding similar ones", "pairs"),
     "match": Stage("matching photos", "pairs compared", "matches"),
@@ -42,8 +39,11 @@ STAGES = {
     "settle": Stage("adjusting with a principal point for each photo", "adjustments of principal points"),
 }
 _ORDER = tuple(STAGES)
-# Time of the further searches for features, relative to the first, see `engine.features`.
-_SEARCH_FACTORS = {"enlarge": 3.0, "faint": 1.0, "faint-enlarged": 3.0}
+# Memory of SIFT per pixel of the searched picture: it is enlarged to four times the pixels; of that, and of all smaller
+# octaves together a third more, six blurred pictures and five differences are kept in float32.
+_SIFT_BYTES = 4 * 4 / 3 * 11 * 4
+# Large photos are searched few at a time, so that all pictures of SIFT need no more than this, or one photo at a time.
+_MOST_SIFT_BYTES = 2e9
 # A stage that took less than planned shortens the others by no more than this factor. Replays of 14 captures are within
 # a factor of two of what is left at 86 % of their moments, without a limit at 62 %.
 _LEAST_STRETCH = 0.8
@@ -82,8 +82,8 @@ def make_plan(photos: Photos, pairing: Pairing, search: Search, *, threads: int)
     all_pairs = math.comb(count, 2)
     pairs = min(len(pairing.pairs) + pairing.neighbours * count, all_pairs)
     sizes = [(photo.width, photo.height) for photo in photos.photos]
-    searched = _searched_pixels(sizes, max_image_size=search.max_image_size)
-    features = min(search.max_features, round(0.015 * sum(searched) / max(count, 1)))
+    searched = searched_pixels(sizes, max_image_size=search.max_image_size)
+    features = min(search.max_features, round(0.009 * sum(searched) / max(count, 1)))
     look_alikes = all_pairs * 0.0003 * (retrieval_feature_count(count) / 256) ** 2
     seconds = {
         "extract": extraction_seconds(sizes, max_image_size=search.max_image_size) / threads,
@@ -93,8 +93,9 @@ def make_plan(photos: Photos, pairing: Pairing, search: Search, *, threads: int)
         "check": checking_seconds(count),
         "stabilise": 1.2 + count * 0.02,
     }
-    # The libraries, each photo in the mapper, and the picture that each thread searches enlarged.
-    memory_bytes = 500e6 + count * 1.5e6 + threads * max(searched, default=0.0) * 70
+    # The libraries, each photo in the mapper, and the pictures that are searched at the same time.
+    largest = max(searched, default=0.0)
+    memory_bytes = 500e6 + count * 1.5e6 + searched_at_a_time(largest, threads=threads) * largest * _SIFT_BYTES
     return Plan(
         photos=count,
         max_image_size=search.max_image_size,
@@ -109,11 +110,17 @@ def make_plan(photos: Photos, pairing: Pairing, search: Search, *, threads: int)
 
 def extraction_seconds(sizes: Iterable[tuple[int, int]], *, max_image_size: int) -> float:
     """Estimate the CPU seconds to extract features from photos of these sizes (width, height)."""
-    return sum(_searched_pixels(sizes, max_image_size=max_image_size)) / 1e6 * 0.4
+    return sum(searched_pixels(sizes, max_image_size=max_image_size)) / 1e6 * 0.3
 
 
-def _searched_pixels(sizes: Iterable[tuple[int, int]], *, max_image_size: int) -> list[float]:
+def searched_pixels(sizes: Iterable[tuple[int, int]], *, max_image_size: int) -> list[float]:
+    """Return the number of pixels in which features are searched for, for photos of these sizes (width, height)."""
     return [width * height * min(1.0, max_image_size / max(width, height)) ** 2 for width, height in sizes]
+
+
+def searched_at_a_time(pixels: float, *, threads: int) -> int:
+    """Return how many pictures of so many pixels are searched for features at the same time."""
+    return max(1, min(threads, int(_MOST_SIFT_BYTES / (pixels * _SIFT_BYTES + 1))))
 
 
 def matching_seconds(pairs: int, *, max_features: int) -> float:
@@ -148,10 +155,9 @@ class TimeEstimate:
     The planned seconds of the current stage are scaled by the time it has taken so far, after its beginning; those of
     later stages by the smallest scale of any stage, at least 0.8. A slow machine slows all stages, whereas a single
     slow stage has its own cause (matches of shiny things, poses of a dense walk), and so has a single fast one. Work
-    that an earlier call has done does not count. Which photos are searched again is known only after the first search
-    for features, how many features the matcher compares only after the last, whether there are sub-models to merge or
-    single photos to locate only after mapping, and whether principal points differ only after a trial; if that adds
-    work, the fraction done stays constant until it is correct again.
+    that an earlier call has done does not count. How many features the matcher compares is known only after they are
+    found, whether there are sub-models to merge or single photos to locate only after mapping, and whether principal
+    points differ only after a trial; if that adds work, the fraction done stays constant until it is correct again.
 
     `clock` returns seconds.
     """
@@ -181,11 +187,7 @@ class TimeEstimate:
                 self._seconds[name] = self._planned[name] = seconds(self._plan.photos, matches=done)
             stage, done, total = self._at
         self._at = (stage, done, total)
-        if stage in _SEARCH_FACTORS:
-            searches = {name: self._seconds[name] for name in _SEARCH_FACTORS}
-            searches[stage] = _SEARCH_FACTORS[stage] * self._planned["extract"] * total / max(self._plan.photos, 1)
-            self._seconds = self._planned | searches
-        elif stage == "merge":
+        if stage == "merge":
             self._seconds[stage] = 0.2 * self._planned["map"]
         elif stage == "locate":
             self._seconds[stage] = 0.7 * total

@@ -14,15 +14,15 @@ CAMERA_MODELS = (
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "EQUIRECTANGULAR"),
 )
 
-# More than the longer side of any photo, so that features are extracted at full size.
-FULL_SIZE = 100_000
+# Longer side of the largest pictures that are searched; SIFT enlarges them, so smaller features would be noise.
+LARGEST_PX = 3200
 _USUAL_FEATURES, MOST_FEATURES = 4096, 8192
 # (max_image_size, max_features). Measured poses hardly change from the first to the last; the later ones place photos
 # that are hard to match more often.
 QUALITIES: dict[str, tuple[int, int | None]] = {
     "fast": (1000, 2048),
     "default": (1600, None),
-    "best": (FULL_SIZE, MOST_FEATURES),
+    "best": (LARGEST_PX, MOST_FEATURES),
 }
 
 # From this many photos on, half of the features gave the same poses in about half of the time or less: see "Hundreds of
