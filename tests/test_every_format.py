@@ -73,8 +73,9 @@ def test_photos_that_a_model_does_not_place_are_counted(name, tmp_path):
     scene = load_scene(tmp_path)
     first = scene.frames[0].image
     assert first is not None
-    for name in ("y.jpg", "z.jpg", "notes.txt"):
-        shutil.copy(first, first.with_name(name))
+    layers = (f"{first.name}.mask.png", f"{first.name}.texture.jpg", f"{first.stem}_mask.png")  # not photos
+    for other in ("y.jpg", "z.jpg", "notes.txt", *layers):
+        shutil.copy(first, first.with_name(other))
     text = describe_source(tmp_path, scene)
     assert "3 of 3 photos on disk; 2 photos beside them, such as y.jpg, without a pose" in text
     assert text.endswith(f"run nerfcli poses {first.parent}")

@@ -210,9 +210,11 @@ def describe_source(path: Path, scene: Capture) -> str:
 
 
 def _without_pose(scene: Capture) -> tuple[Path, list[Path]]:
-    """Return the folder of a scene's photos, with those of the photos in it that the scene does not have."""
-    images = [frame.image for frame in scene.frames if frame.image is not None]
-    folder = Path(os.path.commonpath([image.parent for image in images]))
-    there = [file for parent in sorted({image.parent for image in images}) for file in list_images(parent)]
-    masks = {name for image in images for name in (image.name, f"{image.stem}_mask")}
-    return folder, [file for file in there if file not in {*images} and file.stem not in masks]
+    """Return the folder of a scene's photos, with the photos in it that the scene does not have."""
+    images = {frame.image for frame in scene.frames if frame.image is not None}
+    parents = sorted({image.parent for image in images})
+    others = [file for parent in parents for file in list_images(parent) if file not in images]
+    # Masks as COLMAP, OpenDroneMap and RealityScan name them are no photos: a.jpg.png, a_mask.png, a.jpg.mask.png.
+    of_photos = {name for image in images for name in (image.name, f"{image.stem}_mask")}
+    others = [file for file in others if of_photos.isdisjoint((file.stem, Path(file.stem).stem))]
+    return Path(os.path.commonpath(parents)), others
