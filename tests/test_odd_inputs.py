@@ -531,16 +531,20 @@ def test_a_frame_has_its_own_focal_length_in_either_key(tmp_path):
 
 
 def test_a_list_of_distortion_terms_replaces_single_ones(tmp_path):
-    """As in nerfstudio, for the file or for a frame."""
+    """As in nerfstudio, for the file or for a frame. Photos of Aria that were undistorted have 12 zeros."""
     content = written(tmp_path, k1=0.3, camera_model="OPENCV", distortion_params=[-0.05, 0.02, 0.0, 0.0, 0.001, -0.002])
-    content["frames"][1]["distortion_params"] = [0.0] * 6
-    first, second, *_ = read_again(tmp_path, content).frames
+    content["frames"][1]["distortion_params"], content["frames"][2]["distortion_params"] = [0.0] * 12, [0] * 4
+    first, second, third, *_ = read_again(tmp_path, content).frames
     assert first.camera == Camera("OPENCV", *SIZE, (*PINHOLE.params, -0.05, 0.02, 0.001, -0.002))
-    assert second.camera == PINHOLE
+    assert second.camera == third.camera == PINHOLE
     with pytest.raises(UserError, match="distortion_params is a list of 5"):
         read_again(tmp_path, content | {"distortion_params": [0.1] * 5})
     with pytest.raises(UserError, match="camera_model 'FISHEYE624' is not supported"):
         read_again(tmp_path, content | {"camera_model": "fisheye624", "distortion_params": [0.1] * 12})
+    fisheye = {"distortion_params": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0], "is_fisheye": True}  # as instant-ngp says it
+    for model in ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE"):
+        first, *_ = read_again(tmp_path, content | fisheye | {"camera_model": model}).frames
+        assert first.camera == Camera("OPENCV_FISHEYE", *SIZE, (*PINHOLE.params, 0.1, 0.0, 0.0, 0.0))
 
 
 def test_two_keys_that_give_different_focal_lengths_are_said(tmp_path):

@@ -69,18 +69,20 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
     foreign = next((key for key in _FOREIGN if record.get(key) not in (None, False)), None)
     if foreign is not None:
         raise malformed(where, f"the lens model of {foreign} is not supported", "undistort the pictures first")
-    if model not in (*_PERSPECTIVE_MODELS, *_FISHEYE_MODELS):
+    is_fisheye = model in _FISHEYE_MODELS or record.get("is_fisheye") is True
+    if not is_fisheye and model not in _PERSPECTIVE_MODELS:
         supported = ", ".join(str(name) for name in (*_PERSPECTIVE_MODELS[1:], *_FISHEYE_MODELS, "EQUIRECTANGULAR"))
         raise malformed(where, f"camera_model {model!r:.80} is not supported", f"expected one of {supported}")
-    if record.get(_LIST):
-        values = fields.vector(record, _LIST, len(_LISTED), where)
-        record = record | dict(zip(_LISTED, values.tolist(), strict=True))
+    if terms := record.get(_LIST):
+        is_zero = isinstance(terms, list) and not any(terms)  # as many as other lens models have
+        values = [0.0] * len(_LISTED) if is_zero else fields.vector(record, _LIST, len(_LISTED), where).tolist()
+        record = record | dict(zip(_LISTED, values, strict=True))
     focal, centre, skew = _without_distortion(record, size, where)
     head = (*focal, *centre)
     k1, k2, k3, k4, k5, k6, p1, p2 = (number(record, key, where) or 0.0 for key in _INTRINSICS)
     if (k5 or k6) and model != _RATIONAL:
         raise malformed(where, f"k5 is {k5:g} and k6 is {k6:g}", f"only camera_model {_RATIONAL} has these terms")
-    if model in _FISHEYE_MODELS or record.get("is_fisheye") is True:
+    if is_fisheye:
         return fits.fisheye(size, focal, centre, terms=Terms((k1, k2, k3, k4), (p1, p2), skew=skew), where=where)
     if model == _RATIONAL and (k4 or k5 or k6):
         if skew:
