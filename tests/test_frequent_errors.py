@@ -65,6 +65,14 @@ def test_a_capture_two_folders_down_is_pointed_at(tmp_path):
     assert refusal("train", one) == (f"Error: {one} contains no capture", hint)
 
 
+def test_a_scene_is_pointed_at_before_runs(tmp_path):
+    """In folders as the README names them, runs/ comes before scenes/."""
+    WITH_PHOTOS["run"](Views(CAMERA, POSES), tmp_path / "runs/one")
+    one = project(tmp_path / "scenes/one")
+    hint = f"Hint:  there is one in {one} and in 1 other folder: give that folder"
+    assert refusal("train", tmp_path)[1] == hint
+
+
 def test_the_folder_of_photos_in_a_capture_is_given(tmp_path):
     one = project(tmp_path / "one")
     inside = next(path for path in one.iterdir() if path.name != "sparse")

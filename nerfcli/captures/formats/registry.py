@@ -114,14 +114,14 @@ def recognise(path: Path) -> tuple[Format, Path]:
 
 
 def _captures_in(path: Path) -> list[Path]:
-    """Return the folders in a folder which are captures, or else those one level down, as far as they can be read."""
+    """Return the captures in a folder, or else those one level down, as far as they can be read; runs come last."""
     found = list[Path]()
     for pattern in ("*", "*/*"):
         for folder in sorted(path.glob(pattern)) if not found else ():
             with suppress(OSError):
                 if folder.is_dir() and recognised(folder) is not None:
                     found.append(folder)
-    return found
+    return sorted(found, key=lambda folder: run_cameras.find_run(folder) is not None)
 
 
 def refuse_archive(path: Path) -> None:

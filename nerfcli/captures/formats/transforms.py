@@ -154,10 +154,8 @@ def listed_frames(
         path, listed, "depth_file_path", "depth map", places=(home, "depth"), photos=set(places)
     )
     splits = _listed_splits(path, content)
-    unknown = sorted(splits.keys() - set(map(plain_name, texts)))
-    lost_splits = (
-        f"{several(len(unknown), 'photo')} of a split of {path.name} not among its frames: {in_words(unknown)}",
-    )
+    stray = sorted(splits.keys() - set(map(plain_name, texts)))
+    said = f"{several(len(stray), 'photo')} of a split of {path.name} not among its frames: {in_words(stray)}"
     cameras: dict[Camera, Camera] = {}
     fits, poses = Fits(), FramePoses()
     frames, missing, used = [], [], []
@@ -175,7 +173,7 @@ def listed_frames(
         camera = cameras.setdefault(camera, camera)
         frames.append(Frame(names[index], camera, pose, places[index], masks[index], split=split, depth=depth))
         used.append((record, camera))
-    lost = (*lost_masks, *lost_depths, *(lost_splits if unknown else ()))
+    lost = (*lost_masks, *lost_depths, *([said] if stray else ()))
     return frames, missing, (*found.notes, *poses.notes(), *contradictions(used), *fits.notes(), *lost)
 
 
