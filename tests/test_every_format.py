@@ -66,7 +66,7 @@ def test_a_capture_with_photos_is_trained_on(name, tmp_path):
         assert load_scene(file).kind == kind
 
 
-@pytest.mark.parametrize("name", ["colmap", "realityscan-xmp"])
+@pytest.mark.parametrize("name", ["colmap", "reality-capture", "realityscan-xmp"])
 def test_photos_that_a_model_does_not_place_are_counted(name, tmp_path):
     """Regression: a model of 3 of 87 photos was trained on without a word about the others."""
     WITH_PHOTOS[name](VIEWS, tmp_path)

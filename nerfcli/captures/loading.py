@@ -26,7 +26,7 @@ from nerfcli.photos.images import list_images
 from nerfcli.photos.masks import masks_inside
 
 # Formats that leave out photos without a pose, which lie beside the others.
-_BESIDE_OTHERS = ("colmap", "colmap-text", "realityscan-xmp")
+_BESIDE_OTHERS = ("colmap", "colmap-text", "reality-capture", "realityscan-xmp")
 # The edge of a picture, as a fraction of its side.
 _EDGE = 0.01
 
