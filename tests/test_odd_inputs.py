@@ -204,6 +204,13 @@ def test_a_file_in_a_folder_within_that_of_the_photos_is_not_taken_for_one_that_
     assert levels(find(tmp_path, [listed.format(name) for name in "abc"]).paths) == [0, 1, None]
 
 
+@pytest.mark.parametrize("listed", ["{}", "{}.PNG", "/home/x/images/{}.jpg"])
+def test_photos_of_which_some_were_moved_into_a_folder_are_found(listed, tmp_path):
+    """Labels of Metashape name no folders at all."""
+    photos(tmp_path, ["images/a.png", "images/b.png", "images/drone/c.png"])
+    assert levels(find(tmp_path, [listed.format(name) for name in "abc"]).paths) == [0, 1, 2]
+
+
 @pytest.mark.parametrize("write", [colmap, transforms])
 @pytest.mark.parametrize("listed", ["../images/{{}}.png", "{folder}/images/{{}}.png", "images/{{}}.png"])
 def test_photos_are_only_taken_from_the_folder_that_the_user_gives(write, listed, tmp_path):

@@ -219,18 +219,21 @@ def _matched(
 ) -> dict[int, tuple[tuple[int, ...], list[Path]]]:
     """Return the best score of photos for each name that has no exact one, and the photos that have it.
 
-    Where one lies as it is listed, all do: the folders that the names lack then hold masks, previews or rejected photos
-    of the same names.
+    A folder that the names lack holds masks or previews if it has further files of the names of photos that lie as they
+    are listed.
     """
     missing = [index for index, path in enumerate(exact) if path is None]
-    as_listed = len(missing) < len(names)
-    found = {index: _matches(names[index], photos, place, as_listed=as_listed) for index in missing}
-    if not as_listed and any(score[1:2] == (True,) for score, _ in found.values()):
-        found = {index: _matches(names[index], photos, place, as_listed=True) for index in missing}
-    return found
+    found = {index: _matches(names[index], photos, place, has_exact=len(missing) < len(names)) for index in missing}
+    there = {folded(path.stem) for score, best in found.values() if score[1:2] == (True,) for path in best}
+    of_there = (parts for stem in there & photos.keys() for parts in itertools.chain(*photos[stem].values()))
+    copies = {place.path.joinpath(*parts[:-1]) for parts in of_there}
+    return {
+        index: (score, [path for path in best if score[1] or path.parent not in copies])
+        for index, (score, best) in found.items()
+    }
 
 
-def _matches(name: Name, photos: Photos, place: Place, *, as_listed: bool) -> tuple[tuple[int, ...], list[Path]]:
+def _matches(name: Name, photos: Photos, place: Place, *, has_exact: bool) -> tuple[tuple[int, ...], list[Path]]:
     """Return the best score of photos for a name, and the photos that have it."""
     by_folder = next((photos[stem] for stem in name.stems if stem in photos), {})
     # The last folder decides first. With a folder for each photo, all photos may have the same name.
@@ -238,7 +241,7 @@ def _matches(name: Name, photos: Photos, place: Place, *, as_listed: bool) -> tu
     scored: dict[tuple[int, ...], list[Path]] = {}
     for candidates in (in_last, itertools.chain.from_iterable(by_folder.values())):
         for parts in candidates:
-            if (score := _score(name, parts, as_listed=as_listed)) is not None:
+            if (score := _score(name, parts, has_exact=has_exact)) is not None:
                 scored.setdefault(score, []).append(place.path.joinpath(*parts))
         if scored:
             break
@@ -246,19 +249,16 @@ def _matches(name: Name, photos: Photos, place: Place, *, as_listed: bool) -> tu
     return best, scored.get(best, [])
 
 
-def _score(name: Name, parts: tuple[str, ...], *, as_listed: bool) -> tuple[int, ...] | None:
-    """Return how well the parts of a photo's path fit a name, to compare with others; None if they do not.
-
-    Args:
-        as_listed: whether the photo must be in no folder that the name lacks.
-    """
+def _score(name: Name, parts: tuple[str, ...], *, has_exact: bool) -> tuple[int, ...] | None:
+    """Return how well the parts of a photo's path fit a name, to compare with others; None if they do not."""
     folders = [folded(part) for part in parts[:-1]]
     common = 0
     while common < min(len(folders), len(name.folders)) and folders[-1 - common] == name.folders[-1 - common]:
         common += 1
     left = name.folders[: len(name.folders) - common]
     may_lie_deeper = name.is_absolute or all(map(_is_image_folder, left))
-    if len(folders) > common and (as_listed or not may_lie_deeper):
+    # A folder that the name lacks may be that of rejected photos, where others lie exactly as they are listed.
+    if len(folders) > common and (has_exact or not may_lie_deeper):
         return None
     file = PurePosixPath(parts[-1])
     suffix, listed = file.suffix.lower(), name.plain.rpartition("/")[2]
