@@ -193,9 +193,9 @@ def test_features_lie_where_the_mask_is_white(photos, masks, tmp_path):
     (masked, *others), (all_of_it, *same) = found
     assert masked[:, 0].min() >= WIDTH / 2 - 0.5
     assert all_of_it[:, 0].min() < WIDTH / 2
-    clearly = [found[found[:, 0] > WIDTH / 2 + 0.5] for found in (masked, all_of_it)]
-    assert len(clearly[0]) > 50
-    np.testing.assert_array_equal(*clearly)
+    inside, expected = (found[found[:, 0] > WIDTH / 2 + 0.5] for found in (masked, all_of_it))
+    assert len(inside) > 50
+    np.testing.assert_array_equal(inside, expected)
     for one, other in zip(others, same, strict=True):
         np.testing.assert_array_equal(one, other)
 

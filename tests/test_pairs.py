@@ -238,17 +238,17 @@ def plan_of(pairing: Pairing, *, photos: int = 100, threads: int = 1, features: 
 
 def test_the_estimate_falls_with_threads_and_features():
     pairing = choose_pairs(lettered(100), rule="exhaustive")
-    alone, many = plan_of(pairing, features=40), plan_of(pairing, threads=4, features=20)
+    alone, many = plan_of(pairing, features=20), plan_of(pairing, threads=4, features=10)
     assert alone.pairs == 4950
     assert many.seconds["match"] == pytest.approx(alone.seconds["match"] / 8, abs=0.1)
 
 
 def test_small_photos_are_not_planned_with_as_many_features_as_large_ones():
-    """The plan's own figure: 0.015 features per searched pixel, but never more than the settings allow."""
+    """The plan's own figure: 0.009 features per searched pixel, but never more than the settings allow."""
     photos = lettered(100)
     pixels = photos[0].width * photos[0].height
-    assert plan_of(choose_pairs(photos, rule="exhaustive")).features == round(0.015 * pixels) < 4096
-    assert plan_of(choose_pairs(photos, rule="exhaustive"), features=30).features == 30
+    assert plan_of(choose_pairs(photos, rule="exhaustive")).features == round(0.009 * pixels) < 4096
+    assert plan_of(choose_pairs(photos, rule="exhaustive"), features=20).features == 20
 
 
 def test_look_alikes_bound_the_number_of_pairs():

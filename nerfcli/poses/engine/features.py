@@ -89,8 +89,7 @@ def _search(job: Job, number: int) -> Features:
 def _used_pixels(job: Job, number: int) -> np.ndarray | None:
     if not job.masks or not job.masks[number].key:
         return None
-    mask = cv2.imread(str(job.mask_folder / f"{job.files[number]}.png"), cv2.IMREAD_GRAYSCALE)
-    return mask > 0
+    return read_image(job.mask_folder / f"{job.files[number]}.png")[..., 0] > 0
 
 
 def _write(database: pycolmap.Database, image_id: int, features: Features) -> None:
