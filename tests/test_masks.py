@@ -13,6 +13,7 @@ from PIL import Image
 from synthetic_captures import job_of
 
 from nerfcli.errors import UserError
+from nerfcli.matching.features import find_features
 from nerfcli.photos.images import read_image, write_png
 from nerfcli.photos.masks import find_mask, mask_of, read_mask
 from nerfcli.poses.engine.features import extract, feature_keys
@@ -217,6 +218,16 @@ def test_a_small_part_gets_as_many_features_as_a_whole_photo_would(masks, tmp_pa
     with pycolmap.Database.open(str(job.database)) as database:
         masked, whole = (database.num_keypoints_for_image(image_id) for image_id in (1, 2))
     assert masked > 0.5 * whole
+
+
+def test_the_strongest_features_of_the_used_part_are_kept():
+    """As many as requested, and further ones only if they are as strong as the last."""
+    grey = np.full((240, 320), 128, np.uint8)
+    grey[:, 160:] = np.random.default_rng(0).integers(0, 255, (240, 160), dtype=np.uint8)
+    used = np.tile(np.arange(320) >= 160, (240, 1))
+    responses = find_features(grey, longer_side_px=320, most=50, used=used).responses
+    assert len(responses) >= 50
+    assert np.sort(responses)[-50] == responses.min()
 
 
 def test_another_mask_means_other_features(photos, masks, tmp_path):

@@ -80,7 +80,7 @@ def find_features(
     # OpenCV has pixel centres at whole numbers.
     found = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64).reshape(-1, 2) + 0.5
     responses = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
-    kept = responses >= (-np.partition(-responses, most)[most] if len(responses) > most else 0)
+    kept = responses >= (-np.partition(-responses, most - 1)[most - 1] if len(responses) > most else 0)
     return Features(
         found[kept] * (width / size[0], height / size[1]),
         np.array([keypoint.size for keypoint in keypoints], dtype=np.float32)[kept] * np.float32(width / size[0]),
