@@ -852,6 +852,15 @@ def test_a_long_focal_length_that_the_photos_determine_is_accepted(tmp_path: Pat
     assert camera.mean_focal_length() == pytest.approx(3600.0, rel=0.02)
 
 
+@pytest.mark.parametrize(("size", "features", "more"), [(3199, 8192, True), (3200, 8192, False), (6400, 16384, False)])
+def test_the_largest_pictures_are_not_searched_again(solved: Solved, size: int, features: int, more: bool):
+    """Photos of 7,680 pixels, as of panoramas: another search would be of the same pictures, or for fewer features."""
+    groups = tuple(replace(group, width=7680, height=3840) for group in solved.job.groups)
+    job = replace(solved.job, groups=groups, max_image_size=size, max_features=features)
+    tried = attempts.MappingAttempts(job, lambda *progress: None, lambda note: None)
+    assert tried.can_have_more_features() == more
+
+
 @pytest.mark.parametrize(
     ("photos", "features", "halved_from", "again"),
     [

@@ -122,7 +122,7 @@ class MappingAttempts:
         job, are_many = self.job, self.photos > _MOST_FOR_ALL
         most = job.halved_from if are_many else MOST_FEATURES
         limited = job.max_features < most and max(feature_counts(job), default=0) >= job.max_features
-        larger = any(max(group.width, group.height) > job.max_image_size for group in job.groups)
+        larger = _longest_px(job) > job.max_image_size
         return limited or (larger and not are_many)
 
     def have_unmatched_pairs(self) -> bool:
@@ -319,8 +319,12 @@ def _with_larger_pictures(job: Job, seconds: float) -> Job:
     matching = matching_seconds(len(more.pairs), max_features=more.max_features)
     full = _search_seconds(replace(more, max_image_size=LARGEST_PX)) - matching
     fraction = min(1.0, max(seconds - matching, 0.0) / full) ** 0.5  # of the longer side: time is proportional to area
-    longest = min(LARGEST_PX, max(max(group.width, group.height) for group in job.groups))
-    return replace(more, max_image_size=max(round(fraction * longest), job.max_image_size))
+    return replace(more, max_image_size=max(round(fraction * _longest_px(job)), job.max_image_size))
+
+
+def _longest_px(job: Job) -> int:
+    """Return the longest side of any photo, or of the largest pictures that are searched if that is shorter."""
+    return min(LARGEST_PX, max(max(group.width, group.height) for group in job.groups))
 
 
 # What follows the first attempt, in this order: each if its reason holds, and time is left.
