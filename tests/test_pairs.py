@@ -251,6 +251,17 @@ def test_small_photos_are_not_planned_with_as_many_features_as_large_ones():
     assert plan_of(choose_pairs(photos, rule="exhaustive"), features=20).features == 20
 
 
+def test_the_memory_of_a_search_counts_enlarged_pictures():
+    """Photos that may be searched enlarged by 1.5 need as much as photos of that size."""
+    memory = []
+    for size, searched_px in (((800, 600), 1600), ((1200, 900), 1200), ((800, 600), 1000), ((1000, 750), 1000)):
+        photos = tuple(replace(photo, width=size[0], height=size[1]) for photo in lettered(20))
+        plan = make_plan(Photos(Path("x"), photos, {}), Pairing("", (), 4), Search(searched_px, 4096), threads=16)
+        memory.append(plan.memory_bytes)
+    assert memory[0] == memory[1] > 2e9
+    assert memory[2] == memory[3] > 2e9
+
+
 def test_look_alikes_bound_the_number_of_pairs():
     assert plan_of(Pairing("retrieval", (), 25)).pairs == 2500
     assert plan_of(Pairing("retrieval", (), 90)).pairs == 4950

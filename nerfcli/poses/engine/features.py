@@ -17,7 +17,7 @@ from nerfcli.matching.features import Features, find_features
 from nerfcli.photos.images import read_image
 from nerfcli.poses.engine.database import clear_matches, forget_features, keep_geometries, register_photos
 from nerfcli.poses.input.job import Job, Report, WorkMask, read_stage, repeatedly, stage_key, write_stage
-from nerfcli.poses.input.plan import limit_seconds, matching_seconds, searched_at_a_time, searched_pixels
+from nerfcli.poses.input.plan import ENLARGEMENT, limit_seconds, matching_seconds, searched_at_a_time
 
 # Most RANSAC trials to verify a pair; pycolmap's 10,000 take twice as long and verify no further pair of 30 matches.
 _MOST_TRIALS = 2000
@@ -30,9 +30,8 @@ _FEATURES_VERSION = (
 _MATCHES_VERSION = "ratio 0.8, cross-checked"
 # Contrast that a feature needs, see `find_features`. Half of OpenCV's default, as pycolmap asks for.
 _CONTRAST = 0.02
-# A photo with fewer than this fraction of the requested features is searched again, enlarged by this factor, if that is
-# not above the size of the largest searched pictures: frames of small videos have matches in their finest detail.
-_ENLARGED_BELOW, _ENLARGEMENT = 3 / 4, 1.5
+# A photo with fewer than this fraction of the requested features is searched again, enlarged.
+_ENLARGED_BELOW = 3 / 4
 # Photos of dark, blurred or uniform surfaces have hardly any feature with that contrast, but match with a quarter. That
 # is enough where fewer than this fraction of the requested features are found.
 _FAINT_BELOW = 1 / 8
@@ -55,8 +54,7 @@ def extract(job: Job, report: Report) -> None:
     # From here on, all features in the database are those of `keys`.
     write_stage(stage_path, _FEATURES_VERSION, keys)
     total = len(job.files)
-    largest = max(searched_pixels(job.sizes.values(), max_image_size=job.max_image_size))
-    at_a_time = searched_at_a_time(largest, threads=job.threads)
+    at_a_time, _ = searched_at_a_time(job.sizes.values(), max_image_size=job.max_image_size, threads=job.threads)
     own_threads = cv2.getNumThreads()
     cv2.setNumThreads(job.threads // at_a_time)
     try:
@@ -78,7 +76,7 @@ def _search(job: Job, number: int) -> Features:
     used = _used_pixels(job, number)
     search = partial(find_features, grey, longer_side_px=job.max_image_size, most=job.max_features, used=used)
     features = search(contrast=_CONTRAST)
-    enlargement = min(_ENLARGEMENT, job.max_image_size / max(grey.shape))
+    enlargement = min(ENLARGEMENT, job.max_image_size / max(grey.shape))
     if len(features.pixels) < _ENLARGED_BELOW * job.max_features and enlargement > 1:
         search = partial(search, enlargement=enlargement)
         features = search(contrast=_CONTRAST)

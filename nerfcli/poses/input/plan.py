@@ -39,6 +39,9 @@ STAGES = {
     "settle": Stage("adjusting with a principal point for each photo", "adjustments of principal points"),
 }
 _ORDER = tuple(STAGES)
+# Photos with few features are searched again, enlarged by this factor, or up to the size of the largest searched
+# pictures: frames of small videos have matches in their finest detail.
+ENLARGEMENT = 1.5
 # Memory of SIFT per pixel of the searched picture: it is enlarged to four times the pixels; of that, and of all smaller
 # octaves together a third more, six blurred pictures and five differences are kept in float32.
 _SIFT_BYTES = 4 * 4 / 3 * 11 * 4
@@ -82,7 +85,7 @@ def make_plan(photos: Photos, pairing: Pairing, search: Search, *, threads: int)
     all_pairs = math.comb(count, 2)
     pairs = min(len(pairing.pairs) + pairing.neighbours * count, all_pairs)
     sizes = [(photo.width, photo.height) for photo in photos.photos]
-    searched = searched_pixels(sizes, max_image_size=search.max_image_size)
+    searched = _searched_pixels(sizes, max_image_size=search.max_image_size)
     features = min(search.max_features, round(0.009 * sum(searched) / max(count, 1)))
     look_alikes = all_pairs * 0.0003 * (retrieval_feature_count(count) / 256) ** 2
     seconds = {
@@ -94,8 +97,7 @@ def make_plan(photos: Photos, pairing: Pairing, search: Search, *, threads: int)
         "stabilise": 1.2 + count * 0.02,
     }
     # The libraries, each photo in the mapper, and the pictures that are searched at the same time.
-    largest = max(searched, default=0.0)
-    memory_bytes = 500e6 + count * 1.5e6 + searched_at_a_time(largest, threads=threads) * largest * _SIFT_BYTES
+    _, searches_bytes = searched_at_a_time(sizes, max_image_size=search.max_image_size, threads=threads)
     return Plan(
         photos=count,
         max_image_size=search.max_image_size,
@@ -104,23 +106,25 @@ def make_plan(photos: Photos, pairing: Pairing, search: Search, *, threads: int)
         pairs=pairs,
         seconds={stage: round(value, 1) for stage, value in seconds.items() if value > 0},
         features=features,
-        memory_bytes=round(memory_bytes),
+        memory_bytes=round(500e6 + count * 1.5e6 + searches_bytes),
     )
 
 
 def extraction_seconds(sizes: Iterable[tuple[int, int]], *, max_image_size: int) -> float:
     """Estimate the CPU seconds to extract features from photos of these sizes (width, height)."""
-    return sum(searched_pixels(sizes, max_image_size=max_image_size)) / 1e6 * 0.3
+    return sum(_searched_pixels(sizes, max_image_size=max_image_size)) / 1e6 * 0.3
 
 
-def searched_pixels(sizes: Iterable[tuple[int, int]], *, max_image_size: int) -> list[float]:
-    """Return the number of pixels in which features are searched for, for photos of these sizes (width, height)."""
-    return [width * height * min(1.0, max_image_size / max(width, height)) ** 2 for width, height in sizes]
+def _searched_pixels(sizes: Iterable[tuple[int, int]], *, max_image_size: int, enlargement: float = 1.0) -> list[float]:
+    return [width * height * min(enlargement, max_image_size / max(width, height)) ** 2 for width, height in sizes]
 
 
-def searched_at_a_time(pixels: float, *, threads: int) -> int:
-    """Return how many pictures of so many pixels are searched for features at the same time."""
-    return max(1, min(threads, int(_MOST_SIFT_BYTES / (pixels * _SIFT_BYTES + 1))))
+def searched_at_a_time(sizes: Iterable[tuple[int, int]], *, max_image_size: int, threads: int) -> tuple[int, float]:
+    """Return how many photos of these sizes (width, height) are searched at the same time, and the bytes for that."""
+    pixels = _searched_pixels(sizes, max_image_size=max_image_size, enlargement=ENLARGEMENT)
+    each = max(pixels, default=0.0) * _SIFT_BYTES
+    count = max(1, min(threads, int(_MOST_SIFT_BYTES / (each + 1))))
+    return count, count * each
 
 
 def matching_seconds(pairs: int, *, max_features: int) -> float:
