@@ -1,7 +1,7 @@
 """pycolmap's database: photos under fixed ids, and removal of entries that are out of date.
 
-pycolmap writes features photo by photo and matches block by block, each in a transaction, and skips existing entries.
-So the database is consistent at any moment, and calling pycolmap again continues the work. This module only has to
+Features are written photo by photo, and matches by pycolmap block by block, each in a transaction; existing entries are
+skipped. So the database is consistent at any moment, and the same calls continue the work. This module only has to
 remove entries that depend on something that has changed.
 
 pycolmap has its own SQLite library. Two SQLite libraries must not have a file open in one process: when one closes it,
