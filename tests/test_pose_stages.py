@@ -400,6 +400,8 @@ def test_planning_writes_nothing(photos: Path):
 @pytest.mark.parametrize(
     ("photos", "asked", "search"),
     [
+        (29, None, Search(192, 8192)),
+        (30, None, Search(192, 4096)),
         (99, None, Search(192, 4096)),
         (100, None, Search(192, 2048, halved_from=4096)),
         (100, 4096, Search(192, 4096)),

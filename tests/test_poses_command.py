@@ -30,7 +30,7 @@ def test_what_is_no_amount_of_memory(text: str):
 
 @pytest.mark.parametrize(
     ("options", "size", "features"),
-    [((), 1600, 4096), (("--quality", "fast"), 1000, 2048), (("--quality", "best", "--max-size", "2000"), 2000, 8192)],
+    [((), 1600, 8192), (("--quality", "fast"), 1000, 2048), (("--quality", "best", "--max-size", "2000"), 2000, 8192)],
 )
 def test_a_dry_run_prints_its_plan_and_no_file(tmp_path: Path, options: tuple[str, ...], size: int, features: int):
     photos = write_photos(tmp_path / "photos", 5)

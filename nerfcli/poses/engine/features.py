@@ -18,6 +18,7 @@ from nerfcli.photos.images import read_image
 from nerfcli.poses.engine.database import clear_matches, forget_features, keep_geometries, register_photos
 from nerfcli.poses.input.job import Job, Report, WorkMask, read_stage, repeatedly, stage_key, write_stage
 from nerfcli.poses.input.plan import ENLARGEMENT, limit_seconds, matching_seconds, searched_at_a_time
+from nerfcli.poses.input.settings import USUAL_FEATURES
 
 # Most RANSAC trials to verify a pair; pycolmap's 10,000 take twice as long and verify no further pair of 30 matches.
 _MOST_TRIALS = 2000
@@ -77,10 +78,11 @@ def _search(job: Job, number: int) -> Features:
     search = partial(find_features, grey, longer_side_px=job.max_image_size, most=job.max_features, used=used)
     features = search(contrast=_CONTRAST)
     enlargement = min(ENLARGEMENT, job.max_image_size / max(grey.shape))
-    if len(features.pixels) < _ENLARGED_BELOW * job.max_features and enlargement > 1:
+    usual = min(job.max_features, USUAL_FEATURES)
+    if len(features.pixels) < _ENLARGED_BELOW * usual and enlargement > 1:
         search = partial(search, enlargement=enlargement)
         features = search(contrast=_CONTRAST)
-    faint = len(features.pixels) < _FAINT_BELOW * job.max_features
+    faint = len(features.pixels) < _FAINT_BELOW * usual
     return search(contrast=_CONTRAST / 4) if faint else features
 
 

@@ -16,7 +16,7 @@ CAMERA_MODELS = (
 
 # Longer side of the largest pictures that are searched; SIFT enlarges them, so smaller features would be noise.
 LARGEST_PX = 3200
-_USUAL_FEATURES, MOST_FEATURES = 4096, 8192
+USUAL_FEATURES, MOST_FEATURES = 4096, 8192
 # (max_image_size, max_features). Measured poses hardly change from the first to the last; the later ones place photos
 # that are hard to match more often.
 QUALITIES: dict[str, tuple[int, int | None]] = {
@@ -28,6 +28,8 @@ QUALITIES: dict[str, tuple[int, int | None]] = {
 # From this many photos on, half of the features gave the same poses in about half of the time or less: see "Hundreds of
 # photos" in docs/research/poses.md.
 _MANY_PHOTOS = 100
+# Fewer photos than this are searched for twice as many: each point is seen by few of them, and training needs points.
+_FEW_PHOTOS = 30
 
 
 @dataclass(frozen=True)
@@ -78,10 +80,15 @@ class Search:
 
 
 def search_for(settings: PoseSettings, count: int) -> Search:
-    """Return the first search of this many photos: by default for 4,096 features, or 2,048 in each of 100 or more."""
-    if settings.max_features is None and count >= _MANY_PHOTOS:
-        return Search(settings.max_image_size, _USUAL_FEATURES // 2, halved_from=_USUAL_FEATURES)
-    return Search(settings.max_image_size, settings.max_features or _USUAL_FEATURES)
+    """Return the first search of this many photos.
+
+    By default it is for 8,192 features in each of fewer than 30 photos, 4,096, and 2,048 in each of 100 or more.
+    """
+    if settings.max_features is not None:
+        return Search(settings.max_image_size, settings.max_features)
+    if count >= _MANY_PHOTOS:
+        return Search(settings.max_image_size, USUAL_FEATURES // 2, halved_from=USUAL_FEATURES)
+    return Search(settings.max_image_size, MOST_FEATURES if count < _FEW_PHOTOS else USUAL_FEATURES)
 
 
 def for_panoramas(search: Search) -> Search:
