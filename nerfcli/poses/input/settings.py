@@ -82,7 +82,7 @@ class Search:
 def search_for(settings: PoseSettings, count: int) -> Search:
     """Return the first search of this many photos.
 
-    By default it is for 8,192 features in each of fewer than 30 photos, 4,096, and 2,048 in each of 100 or more.
+    By default it is for 8,192 features in each of up to 29 photos, 4,096 of up to 99, and 2,048 of more.
     """
     if settings.max_features is not None:
         return Search(settings.max_image_size, settings.max_features)
