@@ -110,6 +110,23 @@ def test_a_fresh_field_is_a_thin_grey_fog():
     assert (rgb.mean(0) - 0.5).abs().max() < 0.25
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_fresh_networks_are_linear(seed: int):
+    """Outputs of sums are sums of outputs: no sign of a weight decides whether a feature can raise the density."""
+    torch.manual_seed(seed)
+    weights = [weight.detach().double() for weight in HashField(HashFieldSettings(contraction="l2")).weights]
+    for network in (weights[:2], weights[2:]):
+
+        def output(inputs: torch.Tensor, network: list[torch.Tensor] = network) -> torch.Tensor:
+            for weight in network[:-1]:
+                inputs = torch.relu(inputs @ weight.T)
+            return inputs @ network[-1].T
+
+        one, other = torch.randn(2, 50, network[0].shape[1], dtype=torch.float64)
+        torch.testing.assert_close(output(2 * one - other), 2 * output(one) - output(other))
+        assert 0.5 < output(one).std() < 2
+
+
 @pytest.mark.parametrize(
     ("detail", "learning"), [(None, 6), (-0.1, 3), (0.0, 4), (0.49, 4), (0.51, 5), (1.0, 6), (2.0, 6)]
 )
