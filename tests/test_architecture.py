@@ -39,7 +39,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "poses.input": {"captures", "photos"},
     "poses.model": {"poses.input", "captures", "matching", "photos", "cameras"},
     "poses.judge": {"poses.model", "poses.input", "matching"},
-    "poses.engine": {"poses.judge", "poses.model", "poses.input", "matching", "photos"},
+    "poses.engine": {"poses.judge", "poses.model", "poses.input", "matching", "photos", "kernels"},
     "poses": {"poses.engine", "poses.judge", "poses.model", "poses.input", "captures", "photos"},
     "doctor": {
         *("poses.engine", "poses.judge", "poses.model", "poses.input", "captures", "matching", "photos", "cameras"),

@@ -1,9 +1,9 @@
 """Find features of photos, and match pairs with pycolmap, continuing from the existing content of its database."""
 
+import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import partial
 from itertools import repeat
 from pathlib import Path
@@ -13,22 +13,26 @@ import numpy as np
 import pycolmap
 
 from nerfcli.errors import duration
+from nerfcli.machine import use_threads
 from nerfcli.matching.features import Features, find_features
 from nerfcli.photos.images import read_image
 from nerfcli.poses.engine.database import clear_matches, forget_features, keep_geometries, register_photos
-from nerfcli.poses.input.job import Job, Report, WorkMask, read_stage, repeatedly, stage_key, write_stage
+from nerfcli.poses.input.job import Job, Report, WorkMask, read_stage, stage_key, write_stage
 from nerfcli.poses.input.plan import ENLARGEMENT, limit_seconds, matching_seconds, searched_at_a_time
 from nerfcli.poses.input.settings import USUAL_FEATURES
 
 # Most RANSAC trials to verify a pair; pycolmap's 10,000 take twice as long and verify no further pair of 30 matches.
 _MOST_TRIALS = 2000
-# The time limit is checked after this many pairs.
-_PAIRS_PER_CALL = 1024
+# Matches are written, and the time limit is checked, after this many pairs.
+_PAIRS_PER_CALL = 128
 # Change these whenever this module would find other features in the same photo, or other matches of the same features.
 _FEATURES_VERSION = (
     "OpenCV, the strongest, enlarged below three quarters, with a quarter of the contrast below an eighth"
 )
-_MATCHES_VERSION = "ratio 0.8, cross-checked"
+_MATCHES_VERSION = "exact, ratio 0.8, cross-checked"
+# Descriptors match if they are at most this far apart, and nearer than this times the second nearest: pycolmap's
+# defaults, 0.7 radians between vectors of length 512.
+_FURTHEST, _RATIO = 1024 * math.sin(0.7 / 2), 0.8
 # Contrast that a feature needs, see `find_features`. Half of OpenCV's default, as pycolmap asks for.
 _CONTRAST = 0.02
 # A photo with fewer than this fraction of the requested features is searched again, enlarged.
@@ -129,42 +133,41 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
     ransac = {"random_seed": job.seed, "max_num_trials": _MOST_TRIALS}
     verification = pycolmap.TwoViewGeometryOptions(ransac=ransac)
     pair_list = Path(job.folder) / "pairs.txt"
-    # Matches are written after each block, so that progress is visible and kept.
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list, block_size=_PAIRS_PER_CALL // 8)
-    ids = job.image_ids
-    with pycolmap.Database.open(job.database) as database:
-        pending = {(ids[i], ids[j]) for i, j in pairs}
-
-        def done() -> int:
-            pending.difference_update([pair for pair in pending if database.exists_two_view_geometry(*pair)])
-            return len(pairs) - len(pending)
-
-        with _watched("match", done, len(pairs), report):
-            for first in range(0, len(pairs), _PAIRS_PER_CALL):
-                if time.perf_counter() - start > most:
-                    break
-                part = pairs[first : first + _PAIRS_PER_CALL]
-                pair_list.write_text("\n".join(f"{job.files[i]} {job.files[j]}" for i, j in part), encoding="utf-8")
-                pycolmap.match_image_pairs(
-                    job.database,
-                    matching_options=options,
-                    pairing_options=pairing,
-                    verification_options=verification,
-                    device=pycolmap.Device.cpu,
-                )
-            else:
-                return None
-        left = len(pairs) - done()  # counted here, since the watching thread has ended
-        return f"matching: {left} of {len(pairs)} pairs are not matched after {duration(most)}"
+    with (
+        pycolmap.Database.open(job.database) as database,
+        ThreadPoolExecutor(job.threads, initializer=use_threads, initargs=(1,)) as pool,
+    ):
+        ids = job.image_ids
+        left = [(i, j) for i, j in pairs if not database.exists_two_view_geometry(ids[i], ids[j])]
+        for first in range(0, len(left), _PAIRS_PER_CALL):
+            report("match", len(pairs) - len(left) + first, len(pairs))
+            if time.perf_counter() - start > most:
+                return f"matching: {len(left) - first} of {len(pairs)} pairs are not matched after {duration(most)}"
+            part = left[first : first + _PAIRS_PER_CALL]
+            _write_matches(database, [(ids[i], ids[j]) for i, j in part], pool)
+            pair_list.write_text("\n".join(f"{job.files[i]} {job.files[j]}" for i, j in part), encoding="utf-8")
+            pycolmap.match_image_pairs(
+                job.database,
+                matching_options=options,
+                pairing_options=pycolmap.ImportedPairingOptions(match_list_path=pair_list),
+                verification_options=verification,
+                device=pycolmap.Device.cpu,
+            )
+    report("match", len(pairs), len(pairs))
+    return None
 
 
-@contextmanager
-def _watched(stage: str, done: Callable[[], int], total: int, report: Report) -> Iterator[None]:
-    """Report `done()` once a second while pycolmap works, at the beginning and at the end.
-
-    pycolmap has no callbacks for matching, so the database is polled, through pycolmap: see `database`.
-    """
-    report(stage, done(), total)
-    with repeatedly(lambda: report(stage, done(), total)):
-        yield
-    report(stage, total, total)
+def _write_matches(database: pycolmap.Database, pairs: Iterable[tuple[int, int]], pool: ThreadPoolExecutor) -> None:
+    """Match the descriptors of pairs (image ids) that have no matches; without Numba, pycolmap does it later."""
+    try:
+        from nerfcli.kernels.nearest import mutual_nearest, prepare
+    except ImportError:
+        return
+    left = [pair for pair in pairs if not database.exists_matches(*pair)]
+    ids = {image_id for pair in left for image_id in pair}
+    photos = {image_id: prepare(database.read_descriptors(image_id).data) for image_id in ids}
+    search = partial(mutual_nearest, ratio=_RATIO, furthest=_FURTHEST)
+    found = pool.map(lambda pair: search(photos[pair[0]], photos[pair[1]]), left)
+    with pycolmap.DatabaseTransaction(database):
+        for pair, matches in zip(left, found, strict=True):
+            database.write_matches(*pair, matches.astype(np.uint32))
