@@ -540,6 +540,30 @@ def test_a_camera_that_only_turns_is_recognised(tmp_path: Path):
     assert turn is not None
     assert turn.parallax_px < 1.5
     assert turn.focal_px == pytest.approx(WIDE.params[0], rel=0.03)
+    assert not turn.stands_still
+
+
+def test_a_camera_that_does_not_move_is_told_from_one_that_turns(solved: Solved):
+    """As on a tripod before something that turns and has few features: only the background's matches are verified."""
+    rng = np.random.default_rng(0)
+    places, noise = rng.uniform(0, 700, (4, 200, 2)), rng.normal(0, 0.3, (4, 200, 2))
+    pairs = [
+        VerifiedPair(one, one + 1, place, place + off)
+        for one, (place, off) in enumerate(zip(places, noise, strict=True), 1)
+    ]
+    turn = best_rotation_fit(pairs, dict.fromkeys(range(1, 6), (WIDE.width, WIDE.height)))
+    assert turn is not None
+    assert turn.stands_still
+    assert turn.moved_px == pytest.approx(0.3 * np.sqrt(2 * np.log(2)), rel=0.1)  # median of a Rayleigh distribution
+    verdict = judge(
+        solved.model,
+        read_verified_pairs(solved.job.database, min_matches=30),
+        solved.job,
+        turn=replace(turn, parallax_px=0),
+    )
+    failure = next(failure for failure in verdict.failures if failure.kind == "no baseline (pure rotation)")
+    assert failure.evidence == "the camera stands still: matches are at the same place in all photos, to 0.4 px"
+    assert "give --masks" in failure.advice
 
 
 def test_turning_on_the_spot_with_an_off_centre_lens_is_recognised(tmp_path: Path):

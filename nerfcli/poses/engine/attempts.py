@@ -64,7 +64,7 @@ def map_with_fallbacks(job: Job, report: Report, tell: Tell = lambda text: None)
     attempts.map("default thresholds", MapperOptions())
     if attempts.too_many_left_out() and _only_turns(given):
         attempts.tell_results()
-        tell("not trying anything else: the camera turned on the spot")
+        tell("not trying anything else: the camera stood still or turned on the spot")
         return attempts.result()
     if attempts.placed_fraction() >= _FEW_FRACTION:  # cheaper than any other way to place the last few
         locate_single_photos(attempts)

@@ -210,13 +210,18 @@ def _no_baseline(turn: RotationFit | None, geometry: Mapping[str, Any], held_out
     Parallax in pixels is also small in small photos and far from the scene, where a model may still be right.
     """
     spread = geometry["camera_spread_over_distance"]
+    advice = "take the photos while walking around the scene or sideways; turning on the spot gives no depth"
     if turn is not None and turn.explains_all and turn.parallax_px < _LEAST_GAIN * (held_out_px or np.inf):
         evidence = f"a rotation of the camera without translation explains all matches to {turn.parallax_px:.1f} px"
+        if turn.stands_still:
+            evidence = (
+                f"the camera stands still: matches are at the same place in all photos, to {turn.moved_px:.1f} px"
+            )
+            advice = "walk around the scene; if something turns in front of the camera, give --masks, white where it is"
     elif spread is not None and spread < _LEAST_SPREAD:
         evidence = f"the cameras are spread over only {100 * spread:.2f} % of their distance from the scene"
     else:
         return []
-    advice = "take the photos while walking around the scene or sideways; turning on the spot gives no depth"
     return [Failure("no baseline (pure rotation)", evidence, advice)]
 
 

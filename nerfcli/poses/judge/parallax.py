@@ -34,16 +34,23 @@ class RotationFit:
     """The best explanation of all matches by rotations of the camera alone.
 
     parallax_px: the remaining error that three pairs in four do not exceed (median over the matches of each). focal_px:
-    as a pinhole in the largest picture; of panoramas, the pixels per radian.
+    as a pinhole in the largest picture; of panoramas, the pixels per radian. moved_px: how far matches are apart in
+    the two pictures of a pair, as for parallax_px.
     """
 
     parallax_px: float
     focal_px: float
+    moved_px: float = np.inf
 
     @property
     def explains_all(self) -> bool:
         """True if there is no significant parallax."""
         return self.parallax_px < NO_PARALLAX_PX
+
+    @property
+    def stands_still(self) -> bool:
+        """True if matches are at the same place in all photos: the camera did not move, whatever turns before it."""
+        return self.moved_px < NO_PARALLAX_PX
 
 
 def best_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[int, int]]) -> RotationFit | None:
@@ -72,7 +79,8 @@ def best_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[i
     simplex = np.vstack([start, start + np.diag((0.15, 0.05, 0.05, 0.01, 0.01))])
     options = {"maxiter": 200, "initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-2}
     found = minimize(left_over, start, method="Nelder-Mead", options=options)
-    return RotationFit(float(found.fun), float(np.exp(found.x[0]) * longest))
+    moved = [np.median(np.linalg.norm(pair.pixels_one - pair.pixels_other, axis=1)) for pair in chosen]
+    return RotationFit(float(found.fun), float(np.exp(found.x[0]) * longest), float(np.quantile(moved, _QUANTILE)))
 
 
 def panorama_rotation_fit(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[int, int]]) -> RotationFit | None:
