@@ -5,6 +5,7 @@ That of a check is in test_pose_checks.
 
 import json
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 import synthetic_captures as synthetic
 from synthetic_captures import WIDE, Noise
 
+from nerfcli.kernels import nearest
 from nerfcli.poses.engine import attempts, features, worker
 from nerfcli.poses.engine.attempts import map_with_fallbacks
 from nerfcli.poses.engine.database import clear_matches
@@ -21,6 +23,7 @@ from nerfcli.poses.input.job import Job
 from nerfcli.poses.input.pairs import all_pairs, in_blocks
 from nerfcli.poses.input.plan import checking_seconds, limit_seconds
 from nerfcli.poses.model import merging
+from nerfcli.poses.model.two_views import count_matches
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +75,19 @@ def test_matching_ends_at_its_limit_and_the_next_call_does_the_rest(job: Job, mo
     assert looked_at(job) == set(pairs[:10])
     assert features.match(job, pairs, lambda *progress: None) is None
     assert looked_at(job) == set(pairs)
+
+
+def test_without_numba_pycolmap_matches(job: Job, monkeypatch: pytest.MonkeyPatch):
+    """Its index is approximate, and may miss a few of the matches."""
+    pairs = sorted(all_pairs(8))
+    found = []
+    for module in (nearest, None):
+        clear_matches(job, "matches", "two_view_geometries")
+        monkeypatch.setitem(sys.modules, "nerfcli.kernels.nearest", module)
+        assert features.match(job, pairs, lambda *progress: None) is None
+        found.append(sum(count for _, _, count in count_matches(job.database)))
+    assert found[0] > 1000
+    assert found[1] == pytest.approx(found[0], rel=0.1)
 
 
 def test_what_was_cut_short_is_kept_with_the_models(job: Job):

@@ -145,7 +145,7 @@ def _find_maxima(
 
 
 @numba.njit(nogil=True, cache=True)
-def _take(found: np.ndarray, likeness: int, number: int, second: int) -> None:
+def _take(found: np.ndarray, likeness: np.int32, number: np.int32, second: np.int32) -> None:
     """Take the two greatest likenesses of a tile into those found so far: the greatest, its number and the second."""
     if likeness > found[0]:
         found[2] = max(found[0], second)

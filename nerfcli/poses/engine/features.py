@@ -158,10 +158,10 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | N
 
 
 def _write_matches(database: pycolmap.Database, pairs: Iterable[tuple[int, int]], pool: ThreadPoolExecutor) -> None:
-    """Match the descriptors of pairs (image ids) that have no matches; without Numba, pycolmap does it later."""
+    """Match the descriptors of pairs (image ids) that have no matches; where Numba fails, pycolmap does it later."""
     try:
         from nerfcli.kernels.nearest import mutual_nearest, prepare
-    except ImportError:
+    except (ImportError, RuntimeError):  # no Numba, or no folder to cache its machine code in
         return
     left = [pair for pair in pairs if not database.exists_matches(*pair)]
     ids = {image_id for pair in left for image_id in pair}
