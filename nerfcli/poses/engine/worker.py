@@ -154,7 +154,7 @@ def replace_non_finite(content: Any) -> Any:
 # The last stage's file, with the data for the report. The model is beside it, in sparse/0.
 RESULT = "result.json"
 # Increased when the same models would give another result, so that scenes of earlier versions are checked again.
-_RESULT_VERSION = 5
+_RESULT_VERSION = 6
 
 
 def main(job_path: str) -> None:
