@@ -116,8 +116,8 @@ class HashField(Field):
 def _make_linear(weights: Iterable[Tensor]) -> None:
     """Make a network of rectified layers linear until it learns: half of the neurons have the negatives of the others.
 
-    With independent neurons, whether a feature can raise the density and change a colour depends on their random signs:
-    in two of three seeds, a tractor amid a courtyard never appears and is painted beyond the walls, 3 dB worse.
+    The random signs of independent neurons would decide how easily a feature raises the density, and with it which of
+    several explanations of the photos is learned: see "The first weights" in docs/research/schedule.md.
     Source: Balduzzi et al. 2017, The shattered gradients problem, arXiv:1702.08591.
     """
     for layer, following in pairwise(weights):

@@ -37,7 +37,7 @@ class Descriptors:
 
 
 def prepare(descriptors: np.ndarray) -> Descriptors:
-    """Prepare SIFT descriptors (N, 128) uint8, whose length is 512 or a few per cent more, for `mutual_nearest`."""
+    """Prepare SIFT descriptors (N, 128) uint8, whose length is at most 512 and a few per cent, for `mutual_nearest`."""
     signed = (descriptors ^ 128).view(np.int8)
     squared = np.einsum("ij,ij->i", signed, signed, dtype=np.int32)
     return Descriptors(torch.from_numpy(signed), _LIKENESS // 2 - squared)
@@ -46,9 +46,8 @@ def prepare(descriptors: np.ndarray) -> Descriptors:
 def mutual_nearest(one: Descriptors, other: Descriptors, *, ratio: float, furthest: float) -> np.ndarray:
     """Return the numbers (M, 2) of descriptors that are each other's nearest, clearly so and not far apart.
 
-    Their distance is at most `furthest`, and less than `ratio` times that to the second nearest in either photo. Of
-    equally near descriptors, the first counts. Several threads may call this at once, each with the threads of its
-    torch.
+    Their distance is at most `furthest`, and less than `ratio` times that to the second nearest in either photo.
+    Several threads may call this at once, each with the threads of its torch.
 
     Example:
         >>> corners = prepare(255 * np.eye(3, 128, dtype=np.uint8))
