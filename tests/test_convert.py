@@ -87,14 +87,6 @@ def test_empty_axes_are_refused(option, tmp_path):
     assert not (tmp_path / "out.json").exists()
 
 
-@pytest.mark.parametrize("convention", [Convention(inverted=True), Convention(intrinsics_scale=2.0)])
-def test_poses_and_sizes_of_a_written_file_cannot_be_chosen(convention, tmp_path):
-    """Regression: they were ignored."""
-    with pytest.raises(ValueError, match="only axes and pixel centre of a written file can be chosen, got Convention"):
-        convert(capture_of([PINHOLE]), tmp_path / "a.json", TargetOptions(format_named("transforms"), convention))
-    assert not (tmp_path / "a.json").exists()
-
-
 def test_an_unknown_format_is_reported_with_the_known_ones():
     """Regression: a bare KeyError."""
     with pytest.raises(UserError, match="unknown format 'nerfstudio'") as raised:

@@ -4,7 +4,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from nerfcli.captures.axes import Convention, expressed, opencv_from_axes, poses
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.format import Format, UserInputs
 from nerfcli.captures.formats.registry import FORMATS, recognise, with_masks
-from nerfcli.captures.orientation import STORED, UPRIGHT, ReorientedCapture, in_pixels
+from nerfcli.captures.orientation import STORED, UPRIGHT, in_pixels
 from nerfcli.errors import GATE_NOT_MET, UserError, several
 
 TOLERANCE_PX = 1e-6
@@ -83,13 +83,15 @@ class TargetOptions:
     """Format and conventions of the written file.
 
     Args:
-        convention: its camera axes and pixel centre.
+        axes: its camera axes; "" for those of the format.
+        pixel_centre: the coordinate of the top-left pixel's centre, see `axes.Convention`.
         allow_loss: whether content that the format cannot hold may be dropped; observations always may.
         pixels: which pixels of EXIF-turned photos the cameras refer to; None for those that programs of the format use.
     """
 
     form: Format
-    convention: Convention = field(default_factory=Convention)
+    axes: str = ""
+    pixel_centre: float = 0.5
     allow_loss: bool = False
     overwrite: bool = False
     pixels: str | None = None
@@ -162,14 +164,14 @@ def convert(capture: Capture, target: Path, wanted: TargetOptions) -> Conversion
     convention = _convention(form, wanted)
     turned = in_pixels(capture, _pixels(form, wanted))
     capture = turned.capture
-    off = len(turned.masks_left_out)
+    off = turned.masks_left_out
     turned_masks = (f"{several(off, 'mask')} not turned like the photo (EXIF orientation)",) if off else ()
     losses = accepted_losses(capture, wanted, turned_masks)
     assert form.write is not None
     with _kept_on_success(path, _files(form, path)):
         form.write(expressed(capture, convention, written_axes=form.axes), path)
         checked, loss_px = _checked(capture, path, form, convention)
-    return Conversion(path, capture, losses, loss_px, checked, _orientation_notes(turned))
+    return Conversion(path, capture, losses, loss_px, checked, turned.notes)
 
 
 def target_path(target: Path, wanted: TargetOptions) -> Path:
@@ -211,31 +213,16 @@ def _pixels(form: Format, wanted: TargetOptions) -> str:
     return wanted.pixels or (UPRIGHT if form.name == "nerfcli" else STORED)
 
 
-def _orientation_notes(turned: ReorientedCapture) -> tuple[str, ...]:
-    notes = []
-    if turned.num_turned:
-        stored = "as stored, as most programs expect" if turned.capture.pixels == STORED else "upright"
-        turning = several(turned.num_turned, "photo has", "photos have")
-        notes.append(f"{turning} an EXIF orientation: the cameras refer to pixels {stored}")
-    if turned.num_unknown:
-        notes.append(
-            f"{several(turned.num_unknown, 'photo is', 'photos are')} missing: cameras of turned ones will be wrong"
-        )
-    return tuple(notes)
-
-
 def _convention(form: Format, wanted: TargetOptions) -> Convention:
     """Return the convention of the file to be written."""
-    axes, pixel_centre = wanted.convention.axes or form.axes, wanted.convention.pixel_centre
-    if wanted.convention != Convention(wanted.convention.axes, pixel_centre=pixel_centre):
-        raise ValueError(f"only axes and pixel centre of a written file can be chosen, got {wanted.convention}")
+    axes = wanted.axes or form.axes
     if not np.array_equal(opencv_from_axes(axes), opencv_from_axes(form.axes)) and not form.open_axes:
         hint = "remove --axes; programs that read this format expect its own axes"
         raise UserError(f"{form.name} prescribes the camera axes {form.axes}, not {axes}", hint)
-    if pixel_centre != 0.5 and not form.open_centre:
+    if wanted.pixel_centre != 0.5 and not form.open_centre:
         hint = "remove --pixel-center; programs that read this format expect its own convention"
         raise UserError(f"{form.name} prescribes the pixel convention: the top-left pixel's centre is (0.5, 0.5)", hint)
-    return Convention(axes, pixel_centre=pixel_centre)
+    return Convention(axes, pixel_centre=wanted.pixel_centre)
 
 
 def _checked(capture: Capture, path: Path, form: Format, convention: Convention) -> tuple[Check, float]:

@@ -15,7 +15,7 @@ import numpy as np
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame, Size
 from nerfcli.captures.capture import Capture, Observations
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, several
 from nerfcli.photos.exif import read_exif
 from nerfcli.photos.images import image_size
 
@@ -173,15 +173,13 @@ class ReorientedCapture:
     """Capture whose cameras refer to the requested pixels.
 
     Args:
-        num_turned: number of cameras that were turned according to their photos' EXIF orientation.
-        num_unknown: number of photos that are not on disk, so that their orientation is unknown.
-        masks_left_out: names of frames whose mask was dropped, as its orientation differs from the turned camera's.
+        masks_left_out: number of masks that were dropped, as their orientation differs from the turned camera's.
+        notes: how many cameras were turned, and how many photos are not on disk, for people.
     """
 
     capture: Capture
-    num_turned: int = 0
-    num_unknown: int = 0
-    masks_left_out: tuple[str, ...] = ()
+    masks_left_out: int = 0
+    notes: tuple[str, ...] = ()
 
 
 def _measured(path: Path, pixels: str) -> Picture:
@@ -192,15 +190,15 @@ def _measured(path: Path, pixels: str) -> Picture:
 def in_pixels(capture: Capture, pixels: str) -> ReorientedCapture:
     """Return the capture with cameras, poses and observations for stored or upright pixels, at the cameras' own size.
 
-    Frames without a photo on disk are left as they are, and reported.
+    Frames without a photo on disk are left as they are, and noted.
     """
     if capture.pixels == pixels:
         return ReorientedCapture(capture)
-    frames, masks_left_out, num_unknown = list(capture.frames), [], 0
+    frames, masks_left_out, unknown, notes = list(capture.frames), 0, 0, []
     turns = np.ones(len(frames), dtype=np.int64)
     for index, frame in enumerate(capture.frames):
         if not frame.has_photo:
-            num_unknown += 1
+            unknown += 1
             continue
         orientation = _turn(frame, pixels)
         if orientation == 1:
@@ -209,13 +207,20 @@ def in_pixels(capture: Capture, pixels: str) -> ReorientedCapture:
         camera, pose = turned(frame.camera, frame.world_from_cam, orientation=orientation)
         mask = frame.mask
         if mask is not None and not _fits(mask, camera, frame.camera, pixels):
-            masks_left_out.append(frame.name)
+            masks_left_out += 1
             mask = None
         frames[index] = replace(frame, camera=camera, world_from_cam=pose, mask=mask)
     turned_capture = replace(
         capture, frames=tuple(frames), observations=_turned_observations(capture, turns), pixels=pixels
     )
-    return ReorientedCapture(turned_capture, int((turns != 1).sum()), num_unknown, tuple(masks_left_out))
+    if count := int((turns != 1).sum()):
+        stored = "as stored, as most programs expect" if pixels == STORED else "upright"
+        turning = several(count, "photo has", "photos have")
+        notes.append(f"{turning} an EXIF orientation: the cameras refer to pixels {stored}")
+    if unknown:
+        missing = several(unknown, "photo is", "photos are")
+        notes.append(f"{missing} missing: cameras of turned ones will be wrong")
+    return ReorientedCapture(turned_capture, masks_left_out, tuple(notes))
 
 
 def upright(frame: Frame, pixels: str) -> Frame:

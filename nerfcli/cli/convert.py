@@ -156,7 +156,6 @@ class FormatOptions:
 
     def target(self) -> "TargetOptions":
         """Return how to write."""
-        from nerfcli.captures.axes import Convention
         from nerfcli.captures.conversion import TargetOptions
         from nerfcli.captures.formats.registry import format_named
 
@@ -166,8 +165,8 @@ class FormatOptions:
             raise typer.BadParameter(f"{stated}; choose one of {', '.join(FORMATS_WRITTEN)}", param_hint="--to")
         one_of(self.pixels, ("stored", "upright"), "--pixels")
         centre = _pixel_centre(self.pixel_center, "--pixel-center")
-        convention = Convention(_axes(self.axes, "--axes"), pixel_centre=centre)
-        return TargetOptions(format_named(to), convention, self.allow_loss, self.overwrite, self.pixels)
+        axes = _axes(self.axes, "--axes")
+        return TargetOptions(format_named(to), axes, centre, self.allow_loss, self.overwrite, self.pixels)
 
 
 @command
