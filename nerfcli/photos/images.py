@@ -50,8 +50,6 @@ _UPRIGHT_FROM_STORED = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-# Steps along rows and columns after the axes were swapped, as 5 alone does.
-_STEPS_AFTER_SWAP = {5: (1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}
 # Exceptions of Pillow's decoders for damaged files; no common base class is documented.
 _DAMAGED = (
     *(OSError, EOFError, SyntaxError, ValueError, TypeError, LookupError, RuntimeError),
@@ -124,9 +122,8 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def upright(stored: np.ndarray, orientation: int) -> np.ndarray:
-    """Turn an array (H, W) of stored pixels by an EXIF orientation that swaps its sides: 5...8."""
-    down, across = _STEPS_AFTER_SWAP[orientation]
-    return np.ascontiguousarray(stored.T[::down, ::across])
+    """Turn an array (H, W) of stored pixels, uint8 or float32, by an EXIF orientation from 2 to 8."""
+    return np.array(Image.fromarray(stored).transpose(_UPRIGHT_FROM_STORED[orientation]))
 
 
 def downscale(image: np.ndarray, factor: float) -> np.ndarray:
