@@ -17,9 +17,9 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.camera_path import (
+    FORMAT,
     find_camera_path,
     losses_camera_path,
-    parse_camera_path,
     read_path,
     write_camera_path,
 )
@@ -93,7 +93,7 @@ def test_a_camera_path_is_distinguished_from_other_files_and_parsed_as_a_capture
     assert find_camera_path(written(tmp_path, {"frames": [], "fl_x": 1.0, "camera_path": []})) is None
     nested = content(camera_type="Perspective", keyframes=[{"matrix": "[1, 2]"}])
     nested["camera_path"][0]["camera_to_world"] = np.array(OPENGL_POSE).reshape(4, 4).tolist()
-    capture = parse_camera_path(written(tmp_path, nested))
+    capture = FORMAT.parse(written(tmp_path, nested))
     assert [frame.name for frame in capture.frames] == ["frame_0000", "frame_0001"]
     assert (capture.kind, capture.missing, capture.points.shape) == ("camera-path", (), (0, 3))
     np.testing.assert_array_equal(capture.frames[0].world_from_cam, capture.frames[1].world_from_cam)
@@ -195,10 +195,7 @@ TRANSPOSED = np.array(OPENGL_POSE).reshape(4, 4).T.ravel().tolist()
         ({"fov": float("nan")}, "fov is nan"),
         ({"camera_to_world": None}, "camera_to_world is None"),
         ({"camera_to_world": OPENGL_POSE[:12]}, "camera_to_world is a list of 12"),
-        (
-            {"camera_to_world": [*OPENGL_POSE[:15], float("inf")]},
-            "camera_to_world contains a number that is not finite",
-        ),
+        ({"camera_to_world": [*OPENGL_POSE[:15], float("inf")]}, "camera_to_world contains a number that is not"),
         ({"camera_to_world": [*OPENGL_POSE[:15], 10**400]}, "camera_to_world is a list of 16"),
         ({"camera_to_world": ["right", *OPENGL_POSE[1:]]}, "camera_to_world is a list of 16"),
         ({"camera_to_world": [[1.0], [2.0, 3.0], [4.0]]}, "camera_to_world is a list of 4"),

@@ -69,11 +69,6 @@ def read_path(path: Path) -> CameraPath:
     return CameraPath(tuple(frames), _fps(content, len(frames), path))
 
 
-def parse_camera_path(path: Path) -> Capture:
-    """Read the views of a camera path as a capture without pictures; see `read_path`."""
-    return Capture(read_path(path).frames, kind="camera-path")
-
-
 def losses_camera_path(capture: Capture) -> tuple[str, ...]:
     """List the properties of a capture's cameras that a camera path cannot hold, one clause each."""
     frames = capture.frames
@@ -183,7 +178,7 @@ FORMAT = Format(
     "a camera path of nerfstudio's viewer",
     "camera_path.json",
     find_camera_path,
-    lambda path, given: parse_camera_path(path),
+    lambda path, given: Capture(read_path(path).frames, kind="camera-path"),
     axes="opengl",
     open_axes=True,
     lacks=("cameras", "points"),

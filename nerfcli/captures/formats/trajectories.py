@@ -8,6 +8,7 @@ Sources: cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats; cvlibs.net/data
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -156,17 +157,13 @@ TUM = Format(
 )
 
 
-KITTI = Format(
-    "kitti",
-    "a trajectory of the KITTI odometry benchmark",
-    ".txt with 8 or 12 numbers a line",
-    lambda path: find_lines(path, columns=12),
-    lambda path, given: _parsed(path, given, _kitti_poses, kind="kitti"),
-    open_axes=True,
+KITTI = replace(
+    TUM,
+    name="kitti",
+    of="a trajectory of the KITTI odometry benchmark",
+    find=lambda path: find_lines(path, columns=12),
+    read=lambda path, given: _parsed(path, given, _kitti_poses, kind="kitti"),
     default_name="poses.txt",
-    files=("*.txt",),
-    lacks=("cameras", "points"),
-    takes_camera=True,
     write=write_kitti,
     losses=losses_kitti,
 )

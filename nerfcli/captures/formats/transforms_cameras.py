@@ -88,11 +88,8 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str, 
         if skew:
             raise malformed(where, f"skew is {skew:g}, which no lens with k4, k5 and k6 has", "undistort the photos")
         return checked_camera(model, width, height, (*head, k1, k2, p1, p2, k3, k4, k5, k6), where=where)
-    if k4 or skew:
+    if k3 or k4 or skew:
         return fits.brown(size, focal, centre, terms=Terms((k1, k2, k3, k4), (p1, p2), skew=skew), where=where)
-    if k3:
-        params = (*head, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
-        return checked_camera("FULL_OPENCV", width, height, params, where=where)
     if k1 or k2 or p1 or p2:
         return checked_camera("OPENCV", width, height, (*head, k1, k2, p1, p2), where=where)
     return checked_camera("PINHOLE", width, height, head, where=where)
