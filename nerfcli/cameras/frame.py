@@ -9,6 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.errors import UserError
 
@@ -74,6 +75,10 @@ class Frame:
     def centre(self) -> np.ndarray:
         """The camera's centre in the world, (3,)."""
         return self.world_from_cam[:3, 3]
+
+    def in_camera(self, points: np.ndarray) -> np.ndarray:
+        """Return points (N, 3), or one point (3,), of the world in the camera's axes."""
+        return rigid.apply(rigid.inverse(self.world_from_cam), points)
 
 
 def frames_named(frames: Sequence[Frame], names: Sequence[str]) -> tuple[Frame, ...]:

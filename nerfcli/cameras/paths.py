@@ -262,7 +262,7 @@ def _show(frames: Sequence[Frame], point: np.ndarray) -> np.ndarray:
     """Return which frames have a point (3,) in their pictures, (frames,) bool; what may stand before it is ignored."""
     shown = np.zeros(len(frames), dtype=bool)
     for index, frame in enumerate(frames):
-        (shown[index],) = frame.camera.shows(rigid.apply(rigid.inverse(frame.world_from_cam), point[None]))
+        (shown[index],) = frame.camera.shows(frame.in_camera(point[None]))
     return shown
 
 

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nerfcli.cameras import rigid
 from nerfcli.cameras.layout import centres_of, focus_point, gaps_between, horizontal_axes, up_direction, views_of
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.colmap import find_model, read_model
@@ -189,7 +188,7 @@ def _depths(scene: Capture) -> np.ndarray:
         depths = np.full(len(frames), np.nan)
         points = scene.points[:: 1 + len(scene.points) // _MOST_POINTS]
         for index, frame in enumerate(frames):
-            local = rigid.apply(rigid.inverse(frame.world_from_cam), points)
+            local = frame.in_camera(points)
             seen = local[frame.camera.shows(local)]
             if len(seen):
                 depths[index] = np.median(np.linalg.norm(seen, axis=1) if frame.camera.is_spherical else seen[:, 2])

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.atomic import atomic_path
-from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.axes import opencv_pose, pose_in_axes
@@ -142,7 +141,7 @@ def _percentile_bounds(capture: Capture) -> np.ndarray:
     bounds = np.full((len(capture.frames), 2), np.nan)
     seen = _points_seen(capture)
     for index, frame in enumerate(capture.frames):
-        depths = rigid.apply(rigid.inverse(frame.world_from_cam), capture.points[seen[index]])[:, 2]
+        depths = frame.in_camera(capture.points[seen[index]])[:, 2]
         depths = depths[depths > 0]
         if len(depths):
             bounds[index] = np.percentile(depths, [_NEAR_PERCENT, _FAR_PERCENT])
@@ -166,15 +165,11 @@ def _points_seen(capture: Capture) -> list[np.ndarray]:
         order = np.argsort(frame_index, kind="stable")
         starts = np.searchsorted(frame_index[order], np.arange(1, len(capture.frames)))
         return np.split(point_index[order], starts)
-    return [
-        np.flatnonzero(frame.camera.shows(rigid.apply(rigid.inverse(frame.world_from_cam), capture.points)))
-        for frame in capture.frames
-    ]
+    return [np.flatnonzero(frame.camera.shows(frame.in_camera(capture.points))) for frame in capture.frames]
 
 
 FORMAT = Format(
     "llff",
-    "poses_bounds.npy",
     "poses_bounds.npy",
     folder_with(FILE),
     parse_llff,
