@@ -170,4 +170,4 @@ def find_alicevision(path: Path) -> Path | None:
     return found
 
 
-FORMAT = Format("alicevision", "AliceVision, Meshroom", ".sfm", find_alicevision, parse_alicevision)
+FORMAT = Format("alicevision", "AliceVision, Meshroom", find_alicevision, parse_alicevision)

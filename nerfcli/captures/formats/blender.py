@@ -136,7 +136,6 @@ def find_blender(path: Path) -> Path | None:
 FORMAT = Format(
     "blender",
     "NeRF's synthetic scenes",
-    "transforms_train.json",
     find_blender,
     parse_blender,
     axes="opengl",

@@ -180,4 +180,4 @@ def find_bundler(path: Path) -> Path | None:
     return by_suffix(".out", "bundle.out", "bundle/bundle.out")(path) or only_file(path, "*.out", BEGINS)
 
 
-FORMAT = Format("bundler", "Bundler", "bundle.out", find_bundler, parse_bundler, axes="opengl")
+FORMAT = Format("bundler", "Bundler", find_bundler, parse_bundler, axes="opengl")

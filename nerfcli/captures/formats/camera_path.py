@@ -176,7 +176,6 @@ def find_camera_path(path: Path) -> Path | None:
 FORMAT = Format(
     "camera-path",
     "a camera path of nerfstudio's viewer",
-    "camera_path.json",
     find_camera_path,
     lambda path, given: Capture(read_path(path).frames, kind="camera-path"),
     axes="opengl",

@@ -223,7 +223,6 @@ def _seen(model_dir: Path) -> str:
 BINARY = Format(
     "colmap",
     "a COLMAP model",
-    "sparse/0/cameras.bin or .txt",
     find_model,
     parse_model,
     files=MODEL_FILES,

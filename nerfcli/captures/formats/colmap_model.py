@@ -77,14 +77,11 @@ def images_of_rows(rows: list[ImageRow]) -> tuple[list[ColmapImage], tuple[str, 
         for i in np.flatnonzero(~usable)
     ]
     notes = left_out(lost, len(rows))
-    rows, cam_from_world = (
-        [row for row, kept in zip(rows, usable.tolist(), strict=True) if kept],
-        cam_from_world[usable],
-    )
-    rotations = rigid.rotation_from_quaternion(cam_from_world[:, :4])
-    poses = rigid.inverse(rigid.from_parts(rotations, cam_from_world[:, 4:]))
+    rotations = rigid.rotation_from_quaternion(cam_from_world[usable, :4])
+    poses = rigid.inverse(rigid.from_parts(rotations, cam_from_world[usable, 4:]))
     images = []
-    for (image_id, name, camera_id, _, pixels, point_ids), pose in zip(rows, poses, strict=True):
+    for index, pose in zip(np.flatnonzero(usable).tolist(), poses, strict=True):
+        image_id, name, camera_id, _, pixels, point_ids = rows[index]
         if not name or not plausible(pixels.reshape(1, -1)).all():
             raise ValueError(f"image {image_id} ({name!r}) has no name, or a feature with invalid coordinates")
         images.append(ColmapImage(image_id, name, camera_id, pose, pixels, point_ids))

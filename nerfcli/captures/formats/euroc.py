@@ -124,4 +124,4 @@ def find_euroc(path: Path) -> Path | None:
     return home if has_poses and any(home.glob("cam*/sensor.yaml")) else None
 
 
-FORMAT = Format("euroc", "a sequence of EuRoC MAV", "mav0/", find_euroc, parse_euroc, open_centre=True)
+FORMAT = Format("euroc", "a sequence of EuRoC MAV", find_euroc, parse_euroc, open_centre=True)

@@ -38,7 +38,6 @@ class Format:
 
     Args:
         of: what it is, or which programs write it.
-        looked_for: what it is recognised by, in a few words for people; "" for formats that are only written.
         find: returns where such a capture is in a file or folder; None if there is none.
         read: reads what `find` found, or what `write` wrote, with the further input of the user; what is damaged is a
             `UserError` that names file and field.
@@ -60,7 +59,6 @@ class Format:
 
     name: str
     of: str
-    looked_for: str
     find: Callable[[Path], Path | None]
     read: Callable[[Path, UserInputs], Capture]
     axes: str = "opencv"

@@ -135,4 +135,4 @@ def find_kapture(path: Path) -> Path | None:
     return folder if all((folder / SENSORS / name).is_file() for name in _FILES) else None
 
 
-FORMAT = Format("kapture", "kapture", "sensors/trajectories.txt", find_kapture, parse_kapture, takes_camera=True)
+FORMAT = Format("kapture", "kapture", find_kapture, parse_kapture, takes_camera=True)

@@ -229,7 +229,6 @@ def find_metashape(path: Path) -> Path | None:
 FORMAT = Format(
     "metashape",
     "Agisoft Metashape",
-    ".xml",
     find_metashape,
     lambda path, given: with_photos(parse_metashape(path), path.parent, given=given.images),
 )

@@ -74,4 +74,4 @@ def find_mvsnet(path: Path) -> Path | None:
     return path if any((path / CAMERA_FOLDER).glob(CAMERA_FILES)) else None
 
 
-FORMAT = Format("mvsnet", "cams/ of MVSNet, BlendedMVS", "cams/", find_mvsnet, parse_mvsnet)
+FORMAT = Format("mvsnet", "cams/ of MVSNet, BlendedMVS", find_mvsnet, parse_mvsnet)

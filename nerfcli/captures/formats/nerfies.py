@@ -135,4 +135,4 @@ def find_nerfies(path: Path) -> Path | None:
     return folder if first and has_keys(first, "orientation", "position") else None
 
 
-FORMAT = Format("nerfies", "Nerfies, HyperNeRF, DyCheck", "camera/*.json", find_nerfies, parse_nerfies)
+FORMAT = Format("nerfies", "Nerfies, HyperNeRF, DyCheck", find_nerfies, parse_nerfies)

@@ -114,4 +114,4 @@ def find_neus(path: Path) -> Path | None:
         raise UserError(f"{found} cannot be read: {error}", "it is damaged: copy it again") from error
 
 
-FORMAT = Format("neus", "projections of IDR, NeuS", ".npz", find_neus, parse_neus)
+FORMAT = Format("neus", "projections of IDR, NeuS", find_neus, parse_neus)

@@ -154,4 +154,4 @@ def find_openmvg(path: Path) -> Path | None:
     return found if found and has_keys(found, "sfm_data_version", "views", "intrinsics", "extrinsics") else None
 
 
-FORMAT = Format("openmvg", "OpenMVG", "sfm_data.json", find_openmvg, parse_openmvg, open_centre=True)
+FORMAT = Format("openmvg", "OpenMVG", find_openmvg, parse_openmvg, open_centre=True)

@@ -241,7 +241,6 @@ def _is_on_earth(content: dict[str, Any], path: Path) -> bool:
 FORMAT = Format(
     "opensfm",
     "OpenSfM, OpenDroneMap",
-    "reconstruction.json",
     lambda path: find_json(path, opening="[", name="reconstruction.json"),
     lambda path, given: with_photos(parse_opensfm(path), path.parent, given=given.images),
     default_name="reconstruction.json",

@@ -58,7 +58,6 @@ def _as_bytes(path: Path, channel: np.ndarray) -> np.ndarray:
 FORMAT = Format(
     "ply",
     "the points only",
-    "",
     lambda path: None,
     lambda path, given: Capture((), read_points(path)[0], (), None, "ply"),
     default_name="points.ply",

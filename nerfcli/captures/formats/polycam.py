@@ -80,4 +80,4 @@ def find_polycam(path: Path) -> Path | None:
     return folder if polycam_folders(folder) is not None else None
 
 
-FORMAT = Format("polycam", "raw data of Polycam", "keyframes/", find_polycam, parse_polycam, axes="opengl")
+FORMAT = Format("polycam", "raw data of Polycam", find_polycam, parse_polycam, axes="opengl")

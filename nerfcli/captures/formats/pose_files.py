@@ -129,7 +129,6 @@ def find_pose_files(path: Path) -> Path | None:
 FORMAT = Format(
     "pose-files",
     "a matrix per photo, as in ScanNet, 7-Scenes, NSVF",
-    "pose/*.txt",
     find_pose_files,
     parse_pose_files,
     takes_camera=True,

@@ -152,7 +152,7 @@ def find_reality_capture(path: Path) -> Path | None:
     return by_suffix(".csv")(path) or only_file(path, "*.csv", "#name,")
 
 
-TABLE = Format("reality-capture", "RealityScan, RealityCapture", ".csv", find_reality_capture, parse_reality_capture)
+TABLE = Format("reality-capture", "RealityScan, RealityCapture", find_reality_capture, parse_reality_capture)
 
 
 _XMP_EXPECTED = "expected an XMP file that RealityScan exported"
@@ -259,4 +259,4 @@ def _has_sidecar(folder: Path) -> bool:
     return any(_NAMESPACE in path.read_bytes() for path in files if path.is_file())
 
 
-XMP = Format("realityscan-xmp", "RealityScan, RealityCapture", ".xmp", find_realityscan_xmp, parse_realityscan_xmp)
+XMP = Format("realityscan-xmp", "RealityScan, RealityCapture", find_realityscan_xmp, parse_realityscan_xmp)

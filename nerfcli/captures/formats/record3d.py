@@ -71,4 +71,4 @@ def find_record3d(path: Path) -> Path | None:
     return found if found and has_keys(found, _POSES, "K", "w", "h") else None
 
 
-FORMAT = Format("record3d", "Record3D", "metadata.json", find_record3d, parse_record3d, axes="opengl")
+FORMAT = Format("record3d", "Record3D", find_record3d, parse_record3d, axes="opengl")

@@ -108,9 +108,11 @@ def recognise(path: Path) -> tuple[Format, Path]:
     if packed := [item for item in sorted(path.iterdir() if path.is_dir() else ()) if item.suffix.lower() in ARCHIVES]:
         hint = f"there is an archive in it: nerfcli convert {in_shell(packed[0])} SCENE --to nerfcli"
         raise UserError(f"{path} contains no capture", hint)
-    usual = ", ".join(form.looked_for for form in FORMATS if form.name in ("nerfcli", "colmap", "transforms"))
-    hint = f"looked for {usual} and the files of many more programs: nerfcli convert --help lists them"
-    raise UserError(f"{path} contains no capture in a supported format", hint)
+    raise UserError(
+        f"{path} contains no capture in a supported format",
+        "looked for scene.json, sparse/0/cameras.bin or .txt, transforms.json and the files of many more programs: "
+        "nerfcli convert --help lists them",
+    )
 
 
 def _captures_in(path: Path) -> list[Path]:

@@ -143,4 +143,4 @@ def _found(file: str, run: Path, written_at: Path) -> Path:
     return there if there.exists() and not here.exists() else here
 
 
-FORMAT = Format("run", "cameras refined by training", "cameras.json of a run", find_run, parse_run)
+FORMAT = Format("run", "cameras refined by training", find_run, parse_run)

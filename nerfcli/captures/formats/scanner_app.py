@@ -60,6 +60,4 @@ def find_scanner_app(path: Path) -> Path | None:
     return files[0].parent if files and has_keys(files[0], _POSE, "intrinsics") else None
 
 
-FORMAT = Format(
-    "3d-scanner-app", "3D Scanner App", "frame_00000.json", find_scanner_app, parse_scanner_app, axes="opengl"
-)
+FORMAT = Format("3d-scanner-app", "3D Scanner App", find_scanner_app, parse_scanner_app, axes="opengl")

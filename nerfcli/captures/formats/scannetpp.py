@@ -55,6 +55,4 @@ def find_scannetpp(path: Path) -> Path | None:
     return next((file for file in files if file.is_file() and find_scannetpp(file)), None)
 
 
-FORMAT = Format(
-    "scannetpp", "ScanNet++", "dslr/nerfstudio/transforms.json", find_scannetpp, parse_scannetpp, axes="opengl"
-)
+FORMAT = Format("scannetpp", "ScanNet++", find_scannetpp, parse_scannetpp, axes="opengl")

@@ -285,7 +285,6 @@ def _named(capture: Capture) -> tuple[Path, list[str]]:
 FORMAT = Format(
     "nerfcli",
     "a scene folder",
-    SCENE_FILE,
     folder_with(SCENE_FILE),
     parse_scene,
     # All files of a model, as its folder is replaced; and the report, as one of other poses must not stay.

@@ -105,6 +105,4 @@ def video_of(folder: Path) -> Path | None:
     return next((folder / name for name in _VIDEOS if (folder / name).is_file()), None)
 
 
-FORMAT = Format(
-    "stray-scanner", "Stray Scanner", ODOMETRY, folder_with(ODOMETRY, MATRIX), parse_stray_scanner, video=video_of
-)
+FORMAT = Format("stray-scanner", "Stray Scanner", folder_with(ODOMETRY, MATRIX), parse_stray_scanner, video=video_of)

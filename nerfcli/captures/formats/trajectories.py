@@ -144,7 +144,6 @@ def find_lines(path: Path, *, columns: int) -> Path | None:
 TUM = Format(
     "tum",
     "a trajectory of the TUM RGB-D benchmark",
-    ".txt with 8 or 12 numbers a line",
     lambda path: find_lines(path, columns=8),
     lambda path, given: _parsed(path, given, tum_poses, kind="tum"),
     open_axes=True,

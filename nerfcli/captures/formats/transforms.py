@@ -286,7 +286,6 @@ def find_transforms(path: Path) -> Path | None:
 FORMAT = Format(
     "transforms",
     "nerfstudio, instant-ngp",
-    "transforms.json",
     find_transforms,
     parse_transforms,
     axes="opengl",

@@ -101,7 +101,6 @@ def _own_camera(folder: Path, size: tuple[int, int]) -> Camera:
 FORMAT = Format(
     "tum-rgbd",
     "a sequence of TUM RGB-D",
-    "rgb.txt",
     folder_with(PHOTOS, TRUTH),
     parse_tum_rgbd,
     open_axes=True,
