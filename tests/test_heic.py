@@ -13,19 +13,17 @@ import pillow_heif
 import pytest
 from commands import completed, nerfcli
 from PIL import ExifTags, Image, ImageOps
-from test_images import exif_with, icc_profile, noise
+from test_images import P3, exif_with, icc_profile, linear_from_srgb, noise
 
 from nerfcli.captures.loading import load_scene
 from nerfcli.errors import UserError
 from nerfcli.photos.exif import read_exif
-from nerfcli.photos.images import image_size, list_images, read_image
+from nerfcli.photos.images import image_size, read_image
 from nerfcli.photos.masks import read_mask
 from nerfcli.poses.input.layout import lay_out_photos
 from nerfcli.poses.input.photos import find_photos
 
 WIDTH, HEIGHT = 96, 64
-# Display P3's primaries, adapted to D50, as phones embed them (columns of the matrix to XYZ).
-DISPLAY_P3 = ((0.5151, 0.2412, -0.0011), (0.2919, 0.6922, 0.0419), (0.1571, 0.0666, 0.7841))
 
 
 def write_heic(path: Path, pixels: np.ndarray | Image.Image, *, exact: bool = True, **options: Any) -> Path:
@@ -70,7 +68,7 @@ def test_its_exif_is_that_of_a_jpeg(tmp_path: Path):
 
 def test_colours_of_display_p3_become_those_of_srgb(tmp_path: Path):
     """As for a PNG file with the same profile; without a change, saturated colours would differ by 30 levels."""
-    profile = icc_profile(DISPLAY_P3, lambda x: np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4))
+    profile = icc_profile(P3, linear_from_srgb)
     pixels = noise(HEIGHT, WIDTH, 3)
     image = Image.fromarray(pixels)
     image.save(tmp_path / "a.png", icc_profile=profile)
@@ -87,11 +85,7 @@ def test_transparency_is_kept(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("cut", "what"),
-    [
-        (0.0, "empty"),
-        (0.0001, "not a readable picture"),
-        *((cut, "damaged or truncated") for cut in (0.01, 0.5, 0.999)),
-    ],
+    [(0.0, "empty"), (1e-4, "not a readable picture"), *((cut, "damaged or truncated") for cut in (0.01, 0.5, 0.999))],
 )
 def test_a_truncated_file_is_named(tmp_path: Path, cut: float, what: str):
     path = write_heic(tmp_path / "a.heic", noise(HEIGHT, WIDTH, 3))
@@ -115,16 +109,6 @@ def test_sixty_corruptions_are_read_or_named(tmp_path: Path):
             except UserError:
                 named += 1
     assert named > 30
-
-
-def test_a_converted_copy_is_used_instead(tmp_path: Path):
-    """A photo that is there twice would be held out and trained on at once."""
-    for name in ("IMG_1.HEIC", "IMG_2.heic", "IMG_3.hif"):
-        write_heic(tmp_path / name, noise(HEIGHT, WIDTH, 3))
-    for name in ("IMG_1.jpg", "IMG_3.PNG"):
-        Image.fromarray(noise(HEIGHT, WIDTH, 3)).save(tmp_path / name)
-    (tmp_path / "IMG_2.MOV").write_bytes(b"the video of a live photo")
-    assert [path.name for path in list_images(tmp_path)] == ["IMG_1.jpg", "IMG_2.heic", "IMG_3.PNG"]
 
 
 def test_a_mask_in_heic_has_no_grey_edge(tmp_path: Path):
