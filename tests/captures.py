@@ -17,36 +17,30 @@ from nerfcli.captures.capture import Capture, Observations
 from nerfcli.errors import BAD_INPUT, UserError
 
 # Every model of COLMAP, with all of its terms in use.
-CAMERAS = {
-    "SIMPLE_PINHOLE": Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 321.0, 239.0)),
-    "PINHOLE": Camera("PINHOLE", 640, 480, (500.0, 501.0, 321.0, 239.0)),
-    "SIMPLE_RADIAL": Camera("SIMPLE_RADIAL", 640, 480, (500.0, 321.0, 239.0, 0.05)),
-    "RADIAL": Camera("RADIAL", 640, 480, (500.0, 321.0, 239.0, 0.05, -0.02)),
-    "OPENCV": Camera("OPENCV", 640, 480, (500.0, 501.0, 321.0, 239.0, 0.05, -0.02, 0.001, 0.002)),
-    "FULL_OPENCV": Camera(
-        "FULL_OPENCV", 640, 480, (500.0, 501.0, 321.0, 239.0, 0.05, -0.02, 0.001, 0.002, 0.01, 0.02, 0.01, 0.003)
+_PARAMS: dict[str, tuple[float, ...]] = {
+    "SIMPLE_PINHOLE": (500.0, 321.0, 239.0),
+    "PINHOLE": (500.0, 501.0, 321.0, 239.0),
+    "SIMPLE_RADIAL": (500.0, 321.0, 239.0, 0.05),
+    "RADIAL": (500.0, 321.0, 239.0, 0.05, -0.02),
+    "OPENCV": (500.0, 501.0, 321.0, 239.0, 0.05, -0.02, 0.001, 0.002),
+    "FULL_OPENCV": (500.0, 501.0, 321.0, 239.0, 0.05, -0.02, 0.001, 0.002, 0.01, 0.02, 0.01, 0.003),
+    "SIMPLE_FISHEYE": (300.0, 321.0, 239.0),
+    "FISHEYE": (300.0, 301.0, 321.0, 239.0),
+    "SIMPLE_RADIAL_FISHEYE": (300.0, 321.0, 239.0, 0.05),
+    "RADIAL_FISHEYE": (300.0, 321.0, 239.0, 0.05, -0.02),
+    "OPENCV_FISHEYE": (300.0, 301.0, 321.0, 239.0, 0.05, -0.02, 0.01, -0.003),
+    "THIN_PRISM_FISHEYE": (300.0, 301.0, 321.0, 239.0, 0.05, -0.02, 0.001, 0.002, 0.01, -0.003, 0.001, 0.002),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (
+        *(300.0, 301.0, 321.0, 239.0, 0.05, -0.02, 0.01, -0.003, 0.001, 0.0005),
+        *(0.001, 0.002, 0.001, 2e-4, 0.002, 1e-4),
     ),
-    "SIMPLE_FISHEYE": Camera("SIMPLE_FISHEYE", 640, 480, (300.0, 321.0, 239.0)),
-    "FISHEYE": Camera("FISHEYE", 640, 480, (300.0, 301.0, 321.0, 239.0)),
-    "SIMPLE_RADIAL_FISHEYE": Camera("SIMPLE_RADIAL_FISHEYE", 640, 480, (300.0, 321.0, 239.0, 0.05)),
-    "RADIAL_FISHEYE": Camera("RADIAL_FISHEYE", 640, 480, (300.0, 321.0, 239.0, 0.05, -0.02)),
-    "OPENCV_FISHEYE": Camera("OPENCV_FISHEYE", 640, 480, (300.0, 301.0, 321.0, 239.0, 0.05, -0.02, 0.01, -0.003)),
-    "THIN_PRISM_FISHEYE": Camera(
-        "THIN_PRISM_FISHEYE",
-        *(640, 480),
-        (300.0, 301.0, 321.0, 239.0, 0.05, -0.02, 0.001, 0.002, 0.01, -0.003, 0.001, 0.002),
-    ),
-    "RAD_TAN_THIN_PRISM_FISHEYE": Camera(
-        "RAD_TAN_THIN_PRISM_FISHEYE",
-        *(640, 480),
-        (300.0, 301.0, 321.0, 239.0, 0.05, -0.02, 0.01, -0.003, 0.001, 0.0005, 0.001, 0.002, 0.001, 2e-4, 0.002, 1e-4),
-    ),
-    "FOV": Camera("FOV", 640, 480, (500.0, 501.0, 321.0, 239.0, 0.5)),
-    "SIMPLE_DIVISION": Camera("SIMPLE_DIVISION", 640, 480, (500.0, 321.0, 239.0, -0.1)),
-    "DIVISION": Camera("DIVISION", 640, 480, (500.0, 501.0, 321.0, 239.0, -0.1)),
-    "EUCM": Camera("EUCM", 640, 480, (500.0, 501.0, 321.0, 239.0, 0.6, 1.1)),
-    "EQUIRECTANGULAR": Camera("EQUIRECTANGULAR", 640, 320, (640.0, 320.0)),
+    "FOV": (500.0, 501.0, 321.0, 239.0, 0.5),
+    "SIMPLE_DIVISION": (500.0, 321.0, 239.0, -0.1),
+    "DIVISION": (500.0, 501.0, 321.0, 239.0, -0.1),
+    "EUCM": (500.0, 501.0, 321.0, 239.0, 0.6, 1.1),
 }
+CAMERAS = {model: Camera(model, 640, 480, params) for model, params in _PARAMS.items()}
+CAMERAS["EQUIRECTANGULAR"] = Camera("EQUIRECTANGULAR", 640, 320, (640.0, 320.0))
 
 
 def ring(
@@ -119,9 +113,9 @@ def reprojection_px(truth: Capture, other: Capture) -> float:
     assert len(truth.frames) == len(other.frames)
     worst = 0.0
     for frame, again in zip(truth.frames, other.frames, strict=True):
-        pixels, valid = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), truth.points))
+        pixels, valid = frame.camera.project(frame.in_camera(truth.points))
         camera = again.camera.resized(frame.camera.width, frame.camera.height)
-        pixels_again, valid_again = camera.project(rigid.apply(rigid.inverse(again.world_from_cam), truth.points))
+        pixels_again, valid_again = camera.project(again.in_camera(truth.points))
         assert valid.sum() > 10
         np.testing.assert_array_equal(valid_again, valid)
         worst = max(worst, float(np.linalg.norm(pixels_again - pixels, axis=1)[valid].max()))

@@ -279,9 +279,8 @@ def _transforms_lens(record: Mapping[str, Any]) -> FileLens:
         return FileLens("EQUIRECTANGULAR", width, height, (width, height))
     head = (record["fl_x"], record["fl_y"], record["cx"], record["cy"])
     if "FISHEYE" in record["camera_model"]:
-        return FileLens(
-            "OPENCV_FISHEYE", width, height, (*head, *(record.get(key, 0.0) for key in ("k1", "k2", "k3", "k4")))
-        )
+        terms = (record.get(key, 0.0) for key in ("k1", "k2", "k3", "k4"))
+        return FileLens("OPENCV_FISHEYE", width, height, (*head, *terms))
     terms = (record.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"))
     return FileLens("FULL_OPENCV", width, height, (*head, *terms))
 

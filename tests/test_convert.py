@@ -296,10 +296,7 @@ FAULTS = {
     "axes of OpenGL": ("llff", llff, "pose_in_axes", lambda pose, _: pose_in_axes(pose, "opengl"), "a ray is off by"),
     "moved points": (
         *("transforms", transforms, "write_points"),
-        *(
-            lambda c, path: write_points(replace(c, points=c.points[:, ::-1]), path),
-            "60 points instead of 60, or other",
-        ),
+        *(lambda c, path: write_points(replace(c, points=c.points[:, ::-1]), path), "60 points instead of 60, or"),
     ),
     "no PLY file": ("transforms", transforms, "write_points", lambda c, path: None, "reading it back fails"),
 }

@@ -159,10 +159,8 @@ def test_epipolar_errors_vanish_in_the_right_convention_alone(meant):
     right = evidence.errors_px(directions, poses_of(reinterpreted(spoiled, meant, parsed_axes="opengl")))
     assert right.max() < 1e-8
     for other in CONVENTIONS[:7]:
-        if (
-            not np.array_equal(opencv_from_axes(other.axes), opencv_from_axes(meant.axes))
-            or other.inverted != meant.inverted
-        ):
+        same_axes = np.array_equal(opencv_from_axes(other.axes), opencv_from_axes(meant.axes))
+        if not same_axes or other.inverted != meant.inverted:
             wrong = evidence.errors_px(directions, poses_of(reinterpreted(spoiled, other, parsed_axes="opengl")))
             assert np.median(wrong) > 5
 

@@ -14,7 +14,6 @@ from test_convert import LIMIT_PX, model_of
 from test_scale import photos_of, sheet_of_markers
 from views import BROWN, PINHOLE, PRISM, capture_of
 
-from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.axes import Convention
 from nerfcli.captures.capture import Capture
@@ -68,7 +67,7 @@ def made_scene(capture: Capture, folder: Path, *, allow_loss: bool = False) -> N
 def seen_upright(capture: Capture, index: int, orientation: int) -> np.ndarray:
     """Return where the photo of a frame shows the points after OpenCV has turned it upright."""
     frame = capture.frames[index]
-    pixels, valid = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), capture.points))
+    pixels, valid = frame.camera.project(frame.in_camera(capture.points))
     assert valid.all()
     turned = []
     for x, y in pixels:
@@ -173,7 +172,7 @@ def test_cameras_of_a_scene_are_for_upright_photos(camera, tmp_path):
     for index, frame in enumerate(scene.frames):
         assert frame.image is not None
         assert read_image(frame.image).shape[:2] == (frame.camera.height, frame.camera.width)
-        pixels, _ = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), capture.points))
+        pixels, _ = frame.camera.project(frame.in_camera(capture.points))
         expected = seen_upright(capture, index, orientations.get(index, 1))
         np.testing.assert_allclose(pixels, expected, rtol=0, atol=1e-8)
         rows = parsed.observations.frame_index == index
@@ -344,9 +343,8 @@ def test_intrinsics_for_another_size_are_reported_once(command, tmp_path):
     capture = photographed(capture_of([PINHOLE]), tmp_path / "images", {0: 6})
     double = Camera("PINHOLE", 1280, 960, tuple(2 * value for value in PINHOLE.params))
     frames = tuple(replace(frame, camera=double) for frame in capture.frames)
-    write_transforms(
-        replace(capture, frames=frames, points=np.zeros((0, 3)), colours=None), tmp_path / "transforms.json"
-    )
+    bare = replace(capture, frames=frames, points=np.zeros((0, 3)), colours=None)
+    write_transforms(bare, tmp_path / "transforms.json")
     if command == "info":
         said = " ".join(json.loads(nerfcli("info", tmp_path, "--json").stdout)["rescaled"])
     elif command == "train":

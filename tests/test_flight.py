@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from captures import random_similarity
 from examples import examples
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -11,7 +12,6 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame, frames_named
 from nerfcli.cameras.paths import fly
-from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 
 few = examples(5)
@@ -120,9 +120,7 @@ def test_between_two_poses_the_camera_stays_near_one_of_them(seed, count):
 def test_a_flight_moves_with_the_world(seed):
     rng = np.random.default_rng(seed)
     poses = random_poses(rng, 5)
-    similarity = Similarity(
-        10.0 ** rng.uniform(-2, 2), Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3)
-    )
+    similarity = random_similarity(rng)
     moved = fly(similarity.apply_pose(poses), 40)
     expected = similarity.apply_pose(fly(poses, 40))
     np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-6 * max(1.0, similarity.scale))
@@ -172,9 +170,8 @@ def named(*names: str) -> list[Frame]:
 def test_frames_by_their_whole_name_and_by_what_ends_only_one():
     frames = named("left/a b.jpg", "right/a b.jpg", "right/ü.png", "ü.png", "plain")
     chosen = frames_named(frames, ["right/a b.jpg", "ü.png", "right/ü", "plain", "left/a b", "plain"])
-    assert [frame.name for frame in chosen] == [
-        *("right/a b.jpg", "ü.png", "right/ü.png", "plain", "left/a b.jpg", "plain")
-    ]
+    expected = ["right/a b.jpg", "ü.png", "right/ü.png", "plain", "left/a b.jpg", "plain"]
+    assert [frame.name for frame in chosen] == expected
     with pytest.raises(UserError, match=r"2 images match a b\.jpg: left/a b\.jpg, right/a b\.jpg"):
         frames_named(frames, ["a b.jpg"])
     with pytest.raises(UserError, match=r"no image is named 'right/a\.jpg'") as caught:

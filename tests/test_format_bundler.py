@@ -8,9 +8,7 @@ import pytest
 from captures import put_photos, refused
 from scipy.spatial.transform import Rotation
 
-from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.bundler import find_bundler, parse_bundler
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.errors import UserError
@@ -43,10 +41,8 @@ def model_text() -> str:
     lines = ["# Bundle file v0.3", "3 7", *(" ".join(map(repr, row)) for row in cameras)]
     for index, point in enumerate(POINTS.tolist()):
         # A view for each camera, but not point 0, which nobody saw.
-        views = [
-            f"{camera} {17 * index} {pixels[index][0]!r} {pixels[index][1]!r}" for camera, pixels in enumerate(seen)
-        ]
-        views = views if index else []
+        places = [pixels[index] for pixels in seen] if index else []
+        views = [f"{camera} {17 * index} {x!r} {y!r}" for camera, (x, y) in enumerate(places)]
         lines += [" ".join(map(repr, point)), f"{index} 128 255", " ".join([str(len(views)), *views])]
     return "\n".join(lines) + "\n"
 
@@ -60,12 +56,8 @@ def write(folder: Path, text: str, names: list[str] = NAMES, *, on_disk: list[st
     return path
 
 
-def parse(path: Path) -> Capture:
-    return parse_bundler(path)
-
-
 def test_cameras_project_as_in_the_manual(tmp_path):
-    capture = parse(write(tmp_path, model_text()))
+    capture = parse_bundler(write(tmp_path, model_text()))
     assert [frame.name for frame in capture.frames] == NAMES
     assert [frame.camera.model for frame in capture.frames] == ["RADIAL", "SIMPLE_RADIAL", "PINHOLE"]
     np.testing.assert_array_equal(capture.points, POINTS)
@@ -74,14 +66,14 @@ def test_cameras_project_as_in_the_manual(tmp_path):
     for frame, lens, (turn, shift) in zip(capture.frames, LENSES, bundler_cameras(), strict=True):
         assert frame.image == tmp_path / frame.name
         np.testing.assert_allclose(frame.centre, -turn.T @ shift, rtol=0, atol=1e-14)
-        pixels, valid = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), POINTS))
+        pixels, valid = frame.camera.project(frame.in_camera(POINTS))
         assert valid.all()
         expected = from_middle(lens, turn, shift) * [1, -1] + [32, 24]
         np.testing.assert_allclose(pixels, expected, rtol=0, atol=1e-9)
 
 
 def test_views_are_where_the_points_project(tmp_path):
-    capture = parse(write(tmp_path, model_text()))
+    capture = parse_bundler(write(tmp_path, model_text()))
     seen = capture.observations
     assert seen is not None
     assert len(seen.pixels) == 18
@@ -90,14 +82,14 @@ def test_views_are_where_the_points_project(tmp_path):
     }
     for frame_index, point_index, pixel in zip(seen.frame_index, seen.point_index, seen.pixels, strict=True):
         frame = capture.frames[frame_index]
-        in_cam = rigid.apply(rigid.inverse(frame.world_from_cam), capture.points[point_index])
+        in_cam = frame.in_camera(capture.points[point_index])
         np.testing.assert_allclose(frame.camera.project(in_cam)[0][0], pixel, rtol=0, atol=1e-9)
 
 
 def test_an_identity_camera_by_hand(tmp_path):
     # It looks along world -z with +y up. The point (1, 2, -10) is 10 px to the right and 20 px above the middle.
     text = "# Bundle file v0.3\n1 1\n100 0 0\n1 0 0\n0 1 0\n0 0 1\n0 0 0\n1 2 -10\n1 2 3\n1 0 5 10.0 20.0\n"
-    capture = parse(write(tmp_path, text, ["./a.jpg 0 1234.5"]))
+    capture = parse_bundler(write(tmp_path, text, ["./a.jpg 0 1234.5"]))
     frame = capture.frames[0]
     assert frame.name == "a.jpg"
     assert frame.camera == Camera("PINHOLE", 64, 48, (100, 100, 32, 24))
@@ -110,7 +102,7 @@ def test_unregistered_and_missing_photos_are_no_frames(tmp_path):
     lines = model_text().splitlines()
     lines[2:7] = ["0 0 0"] * 5
     unseen = [line if len(line.split()) < 12 else "2 " + line.split(maxsplit=5)[5] for line in lines]
-    capture = parse(write(tmp_path, "\n".join(unseen), on_disk=["ü.jpg"]))
+    capture = parse_bundler(write(tmp_path, "\n".join(unseen), on_disk=["ü.jpg"]))
     assert [frame.name for frame in capture.frames] == ["ü.jpg"]
     assert capture.missing == ("b c.jpg",)
     assert capture.notes[-1] == "1 photo without a pose left out: a.jpg"
@@ -123,7 +115,7 @@ def test_the_list_is_found_where_colmap_writes_it(tmp_path):
     path = write(tmp_path, model_text())
     (tmp_path / "list.txt").rename(tmp_path / "bundle" / "model.list.txt")
     with pytest.raises(UserError, match="the list of images next to it is missing"):
-        parse(path)
+        parse_bundler(path)
     path = path.rename(path.with_name("model.bundle.out"))
     given = parse_bundler(path, UserInputs(tmp_path))
     assert [frame.image for frame in given.frames] == [tmp_path / name for name in NAMES]
@@ -172,4 +164,4 @@ def edited(number: int, line: str | None) -> str:
 def test_malformed_files_are_refused_with_file_and_line(tmp_path, text, names, what):
     path = write(tmp_path, text, names)
     with refused(what, tmp_path):
-        parse(path)
+        parse_bundler(path)

@@ -62,11 +62,8 @@ def test_malformed_llff_is_refused(tmp_path):
     np.save(path, llff_rows(3)[:, :15])
     with pytest.raises(UserError, match=r"array of shape \(3, 15\)"):
         load_scene(tmp_path)
-    for column, value, what in (
-        (15, 0.0, "depth bounds 0 and 20"),
-        (14, -1.0, "row 0: .* -1"),
-        (3, np.nan, "row 0: .*finite"),
-    ):
+    wrong = ((15, 0.0, "depth bounds 0 and 20"), (14, -1.0, "row 0: .* -1"), (3, np.nan, "row 0: .*finite"))
+    for column, value, what in wrong:
         rows = llff_rows(1)
         rows[0, column] = value
         np.save(path, rows)

@@ -148,10 +148,7 @@ SHOT = reconstruction()["shots"]["a.jpg"]
         ({"shots": {}}, "lists no images with a pose"),
         ({"shots": {"a.jpg": {**SHOT, "camera": "v1"}}}, r"shots\.'a.jpg': camera is 'v1'"),
         ({"shots": {"a.jpg": {**SHOT, "rotation": [1, 2]}}}, r"shots\.'a.jpg': rotation is a list of 2"),
-        (
-            {"shots": {"a.jpg": {**SHOT, "translation": [1, 2, None]}}},
-            "translation contains a number that is not finite",
-        ),
+        ({"shots": {"a.jpg": {**SHOT, "translation": [1, 2, None]}}}, "translation contains a number that is not"),
         ({"shots": {"a\\b": SHOT, "a/b": SHOT}}, "'a/b' is listed twice"),
         ({"shots": {"\ud800": SHOT}}, "the image's name is"),
         ({"cameras": {"v2 phone": {**CAMERA, "focal": "wide"}}}, r"cameras\.'v2 phone': focal is 'wide'"),
@@ -159,10 +156,7 @@ SHOT = reconstruction()["shots"]["a.jpg"]
         ({"cameras": {"v2 phone": {**CAMERA, "width": 0.5}}}, "width and height are 0.5 and 480"),
         ({"cameras": {"v2 phone": {**CAMERA, "width": 1e12}}}, "width and height are"),
         ({"cameras": {"v2 phone": {**CAMERA, "projection_type": "dual"}}}, "'dual' is not supported"),
-        (
-            {"cameras": {"v2 phone": {**CAMERA, "projection_type": "spherical"}}},
-            "invalid size of an EQUIRECTANGULAR picture: 640x480",
-        ),
+        ({"cameras": {"v2 phone": {**CAMERA, "projection_type": "spherical"}}}, "EQUIRECTANGULAR picture: 640x480"),
         (
             {"cameras": {"v2 phone": {**CAMERA, **RECORDS["fisheye624"], "projection_type": "fisheye624", "k6": 1}}},
             "k5, k6, s1 or s3 beside p1",

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from captures import put_photos, refused
 
-from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.reality_capture import TABLE, parse_reality_capture
@@ -64,7 +63,7 @@ def test_both_programs_tables_project_as_their_exports_for_opencv(tmp_path, head
     in_cam = np.column_stack([rng.uniform(-0.5, 0.5, (100, 2)), np.ones(100)]) * rng.uniform(1, 9, (100, 1))
     for frame, pose, size in zip(capture.frames, poses, SIZES.values(), strict=True):
         in_world = (in_cam * [1, -1, -1]) @ world_from_opengl(*pose[3:]).T + pose[:3]
-        pixels, valid = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), in_world))
+        pixels, valid = frame.camera.project(frame.in_camera(in_world))
         assert valid.all()
         np.testing.assert_allclose(pixels, opencv_pixels(LENS, size, in_cam), rtol=0, atol=1e-9)
 

@@ -180,9 +180,8 @@ def test_a_lens_without_keys_is_listed_and_the_rest_of_it_written(tmp_path, mode
     camera, camera_back = capture.frames[0].camera, back.frames[0].camera
     assert camera_back.focal_px == camera.focal_px
     assert camera_back.principal_point == camera.principal_point
-    assert (
-        reprojection_px(replace(capture, frames=capture.frames[1::2]), replace(back, frames=back.frames[1::2])) < 1e-10
-    )
+    others, others_back = (replace(each, frames=each.frames[1::2]) for each in (capture, back))
+    assert reprojection_px(others, others_back) < 1e-10
     if model == "THIN_PRISM_FISHEYE":
         assert camera_back.params == (*camera.params[:6], *camera.params[8:10])
     if model == "RAD_TAN_THIN_PRISM_FISHEYE":

@@ -29,9 +29,8 @@ def test_photos_of_a_rig_are_held_out_together():
     """The camera beside a held-out one would show nearly the same picture."""
     expected = {f"{camera}/{index:04d}.png" for camera in ("left", "right") for index in (0, 8, 16)}
     assert names_held_out(DEFAULT_HOLDOUT, RIG) == expected == default_split(RIG)
-    assert names_held_out("block:0.15", RIG) == {
-        f"{camera}/{index:04d}.png" for camera in ("left", "right") for index in (8, 9, 10)
-    }
+    middle = {f"{camera}/{index:04d}.png" for camera in ("left", "right") for index in (8, 9, 10)}
+    assert names_held_out("block:0.15", RIG) == middle
 
 
 def test_photos_of_a_rig_without_their_neighbours_count_like_the_others():

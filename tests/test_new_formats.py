@@ -33,7 +33,7 @@ VIEWS = Views(CAMERA, POSES)
 def pixels(capture: Capture, points: np.ndarray) -> np.ndarray:
     """Return where the first frame sees points of the world, (N, 2)."""
     frame = capture.frames[0]
-    return frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), points))[0]
+    return frame.camera.project(frame.in_camera(points))[0]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -42,9 +42,8 @@ def test_files_of_windows_with_a_byte_order_mark_are_read(tmp_path, name):
     for path in tmp_path.rglob("*"):
         if path.suffix in (".json", ".txt", ".csv", ".yaml", ".xmp"):
             path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\r\n", b"\n").replace(b"\n", b"\r\n"))
-    np.testing.assert_allclose(
-        sorted(frame.centre.tolist() for frame in parse(tmp_path).frames), sorted(PLACES.tolist())
-    )
+    centres = sorted(frame.centre.tolist() for frame in parse(tmp_path).frames)
+    np.testing.assert_allclose(centres, sorted(PLACES.tolist()))
 
 
 def brown(k: tuple[float, float, float], p: tuple[float, float], x: float, y: float) -> tuple[float, float]:
@@ -141,9 +140,8 @@ class TestPosesInTime:
     def test_measured_times_are_kept_and_gaps_are_not_bridged(self):
         poses = np.tile(np.eye(4), (4, 1, 1))
         poses[:, 0, 3] = [0, 1, 2, 3]
-        found, is_known = poses_at(
-            np.array([0, 0.1, 0.5, 0.6]), poses, np.array([-1, -0.01, 0.1, 0.3, 0.515, 0.615, 2])
-        )
+        wanted = np.array([-1, -0.01, 0.1, 0.3, 0.515, 0.615, 2])
+        found, is_known = poses_at(np.array([0, 0.1, 0.5, 0.6]), poses, wanted)
         assert is_known.tolist() == [False, True, True, False, True, True, False]
         np.testing.assert_allclose(found[is_known, 0, 3], [0, 1, 2.15, 3], rtol=0, atol=1e-12)
 

@@ -176,19 +176,17 @@ def test_look_at_needs_two_places():
 def test_similarity_inverse_compose_and_matrix_agree(seed):
     rng = np.random.default_rng(seed)
     outer, inner, points = random_similarity(rng), random_similarity(rng), rng.normal(size=(9, 3))
-    size = np.abs(outer.apply(inner.apply(points))).max()
-    np.testing.assert_allclose(
-        outer.compose(inner).apply(points), outer.apply(inner.apply(points)), rtol=0, atol=1e-13 * size
-    )
+    one_by_one = outer.apply(inner.apply(points))
+    tolerance = 1e-13 * np.abs(one_by_one).max()
+    np.testing.assert_allclose(outer.compose(inner).apply(points), one_by_one, rtol=0, atol=tolerance)
     back = outer.inverse().apply(outer.apply(points))
     np.testing.assert_allclose(back, points, rtol=0, atol=1e-12)
     homogeneous = np.concatenate([points, np.ones((9, 1))], axis=1) @ outer.matrix().T
     np.testing.assert_allclose(homogeneous[:, :3], outer.apply(points), rtol=0, atol=1e-13 * outer.scale * 10)
     # The translations that cancel are as large as this.
     tolerance = 1e-14 * max(1.0, np.abs(outer.translation).max())
-    np.testing.assert_allclose(
-        outer.compose(outer.inverse()).matrix(), Similarity.identity().matrix(), rtol=0, atol=tolerance
-    )
+    np.testing.assert_allclose(outer.compose(outer.inverse()).matrix(), np.eye(4), rtol=0, atol=tolerance)
+    np.testing.assert_array_equal(Similarity.identity().matrix(), np.eye(4))
 
 
 @given(seed=seeds)

@@ -37,7 +37,6 @@ from nerfcli.captures.loading import load_scene
 from nerfcli.captures.scale import (
     KnownDistance,
     ScaleEstimate,
-    gps_positions,
     known_distance,
     scale_from_distances,
     scale_from_gps,
@@ -338,20 +337,6 @@ def test_what_gps_cannot_determine():
         scale_from_gps(frames_at(np.zeros((3, 3))), apart)
 
 
-def test_positions_come_from_the_photos(tmp_path):
-    exif = Image.Exif()
-    exif[ExifTags.IFD.GPSInfo] = {1: "N", 2: (48.0, 30.0, 0.0), 3: "W", 4: (11.0, 0.0, 36.0), 5: b"\0", 6: 520.5}
-    Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
-    exif[ExifTags.IFD.GPSInfo] = {1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0)}
-    Image.new("RGB", (8, 8)).save(tmp_path / "nowhere.jpg", exif=exif)
-    Image.new("RGB", (8, 8)).save(tmp_path / "b.jpg")
-    camera = Camera.pinhole(8, 8, 8.0)
-    frames = [Frame(name, camera, np.eye(4), image=tmp_path / name) for name in ("a.jpg", "b.jpg", "nowhere.jpg")]
-    found = gps_positions([*frames, Frame("view", camera, np.eye(4))])
-    assert list(found) == ["a.jpg"]
-    assert found["a.jpg"] == pytest.approx((48.5, -11.01, 520.5), abs=1e-9)
-
-
 # Markers
 
 
@@ -428,9 +413,8 @@ def test_scale_from_a_charuco_board(rows, legacy, tmp_path):
     picture = printed.generateImage((600, 100 * rows), marginSize=0)
     assert (picture[5, 5] == 255) == legacy
     board = CharucoBoard(6, rows, 0.03, 0.022, "DICT_5X5_100", legacy=legacy)
-    frames = photos_of(
-        tmp_path, cv2.copyMakeBorder(picture, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255), per_unit=50
-    )
+    on_paper = cv2.copyMakeBorder(picture, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
+    frames = photos_of(tmp_path, on_paper, per_unit=50)
     estimate = scale_from_charuco(frames, board)
     truth = 0.03 / 2  # squares of 100 pixels at 50 per unit
     assert estimate.metres_per_unit == pytest.approx(truth, rel=0.002)
@@ -514,10 +498,7 @@ def test_corners_through_distorted_lenses_and_how_well_their_error_is_estimated(
     sides = [Side(f"marker {m}", (m, k), (m, (k + 1) % 4), 0.1) for m in range(len(offsets)) for k in range(4)]
 
     corners = {(m, k): square[k] + offset for m, offset in enumerate(offsets) for k in range(4)}
-    seen = [
-        f.camera.project(rigid.apply(rigid.inverse(f.world_from_cam), np.array(list(corners.values()))))[0]
-        for f in frames
-    ]
+    seen = [f.camera.project(f.in_camera(np.array(list(corners.values()))))[0] for f in frames]
 
     def estimate(noise: float) -> ScaleEstimate:
         sightings = {
@@ -546,6 +527,8 @@ def test_positions_in_exif_give_the_scale(tmp_path):
         Image.new("RGB", (64, 48)).save(path, exif=exif)
         pose = rigid.from_parts(np.diag([1.0, -1, -1]), np.array([north, -east, 3.0]) / 10)
         frames.append(Frame(path.name, Camera.pinhole(64, 48, 50.0), pose, image=path))
+    Image.new("RGB", (64, 48)).save(tmp_path / "without.jpg")  # it has no position
+    frames.append(Frame("without.jpg", Camera.pinhole(64, 48, 50.0), pose, image=tmp_path / "without.jpg"))
     write_colmap_binary(Capture(tuple(frames), np.zeros((0, 3)), (), None, "made"), tmp_path / "in")
     done = completed("convert", tmp_path / "in", tmp_path / "out", "--to", "nerfcli", "--scale", "gps", "--json")
     assert json.loads(done.stdout)["scale"]["metres_per_unit"] == pytest.approx(10.0, rel=2e-3)

@@ -45,16 +45,14 @@ def capture_of(rng: np.random.Generator, *, count: int = 8, unit: str = "arbitra
     )
     points = focus + 0.3 * rng.normal(size=(20, 3))
     seen = Observations(np.zeros(20, dtype=np.int64), np.arange(20), rng.random((20, 2)))
-    depths = np.stack([rigid.apply(rigid.inverse(frame.world_from_cam), points)[:, 2] for frame in frames])
+    depths = np.stack([frame.in_camera(points)[:, 2] for frame in frames])
     bounds = np.stack([depths.min(axis=1), depths.max(axis=1)], axis=1)
     colours = rng.integers(0, 256, (20, 3)).astype(np.uint8)
     return Capture(frames, points, ("gone.jpg",), bounds, "test", colours, seen, unit)
 
 
 def pixels_of(capture: Capture) -> np.ndarray:
-    return np.stack(
-        [f.camera.project(rigid.apply(rigid.inverse(f.world_from_cam), capture.points))[0] for f in capture.frames]
-    )
+    return np.stack([f.camera.project(f.in_camera(capture.points))[0] for f in capture.frames])
 
 
 @given(seed=seeds, scale=st.sampled_from([1e-3, 0.7, 1.0, 1e3]))
@@ -64,7 +62,7 @@ def test_a_similarity_changes_no_pixel_and_scales_depths(seed, scale):
     before = capture_of(rng, unit="metre")
     after = transformed(before, random_similarity(rng, scale))
     np.testing.assert_allclose(pixels_of(after), pixels_of(before), rtol=0, atol=1e-9)
-    depths = np.stack([rigid.apply(rigid.inverse(f.world_from_cam), after.points)[:, 2] for f in after.frames])
+    depths = np.stack([f.in_camera(after.points)[:, 2] for f in after.frames])
     assert after.depth_bounds is not None
     np.testing.assert_allclose(after.depth_bounds[:, 0], depths.min(axis=1), rtol=1e-12)
     np.testing.assert_allclose(after.depth_bounds[:, 1], depths.max(axis=1), rtol=1e-12)
