@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from captures import photograph, reprojection_px, with_photos
 from commands import completed, error_of, listing, nerfcli, refusal
+from every_format import parse
 from views import BROWN, FISHEYE, PANORAMA, PINHOLE, PRISM, RADIAL, RATIONAL, SQUARE, capture_of
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.axes import Convention, all_axes, expressed, opencv_from_axes, pose_in_axes, reinterpreted
 from nerfcli.captures.capture import Capture, Observations
-from nerfcli.captures.conversion import TargetOptions, convert, load
+from nerfcli.captures.conversion import TargetOptions, convert
 from nerfcli.captures.formats import blender, llff, transforms, transforms_cameras
 from nerfcli.captures.formats.colmap import write_colmap_binary
-from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.ply import write_points
-from nerfcli.captures.formats.registry import FORMATS, format_named, recognise
+from nerfcli.captures.formats.registry import FORMATS, format_named
 from nerfcli.cli.convert import FORMATS_WRITTEN
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, UserError
 
@@ -134,14 +134,14 @@ def test_colmap_to_a_format_and_back_moves_no_pixel(form, tmp_path):
         more = ["--intrinsics", tmp_path / "camera.json"]
         capture = replace(capture, frames=tuple(replace(frame, camera=PINHOLE) for frame in capture.frames))
     completed("convert", report["path"], tmp_path / "back", "--to", "colmap", "--allow-loss", *more)
-    _, _, again = load(tmp_path / "back", UserInputs(), Convention())
+    again = parse(tmp_path / "back")
     assert reprojection_px(capture, again) < LIMIT_PX
 
 
 def test_axes_and_pixel_centre_of_the_written_file(tmp_path):
     """By hand: with OpenCV axes the matrix is world_from_cam itself, and with centres at 0 cx is half a pixel less."""
     source, out = model_of(tmp_path, capture_of([PINHOLE])), tmp_path / "out.json"
-    capture = load(source, UserInputs(), Convention())[2]
+    capture = parse(source)
     options = ("--axes", "opencv", "--pixel-center", "0", "--allow-loss")
     completed("convert", source, out, "--to", "transforms", *options)
     content = json.loads(out.read_text())
@@ -150,7 +150,7 @@ def test_axes_and_pixel_centre_of_the_written_file(tmp_path):
     assert content["cx"] == PINHOLE.params[2] - 0.5
     options = ("--from-axes", "opencv", "--from-pixel-center", "0")
     assert nerfcli("convert", out, tmp_path / "back", "--to", "colmap", *options).exit_code == 0
-    assert reprojection_px(capture, load(tmp_path / "back", UserInputs(), Convention())[2]) < LIMIT_PX
+    assert reprojection_px(capture, parse(tmp_path / "back")) < LIMIT_PX
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,7 @@ def test_a_file_that_holds_the_inverse_is_read_so(tmp_path):
     (tmp_path / "wrong.json").write_text(json.dumps(content))
     options = ("--from-axes", "opencv", "--from-inverted")
     completed("convert", tmp_path / "wrong.json", tmp_path / "out", "--to", "colmap", *options)
-    assert reprojection_px(capture, load(tmp_path / "out", UserInputs(), Convention())[2]) < LIMIT_PX
+    assert reprojection_px(capture, parse(tmp_path / "out")) < LIMIT_PX
 
 
 def test_intrinsics_for_another_size(tmp_path):
@@ -200,7 +200,7 @@ def test_intrinsics_for_another_size(tmp_path):
     source = model_of(tmp_path, capture_of([double]))
     result = completed("convert", source, tmp_path / "out", "--to", "colmap", "--from-size", "2")
     assert "principal point" not in result.stderr
-    assert load(tmp_path / "out", UserInputs(), Convention())[2].frames[0].camera == PINHOLE
+    assert parse(tmp_path / "out").frames[0].camera == PINHOLE
     warned = nerfcli("convert", source, tmp_path / "as-it-is", "--to", "colmap").stderr
     assert "principal point of" in " ".join(warned.split())
     assert "--from-size" in warned
@@ -215,7 +215,7 @@ def test_the_world_frame_and_its_scale(tmp_path):
     distance = f"{','.join(map(str, first.centre))} {','.join(map(str, second.centre))} {metres}"
     options = ("--origin", "centre-of-cameras", "--world-up", "-y", "--distance", distance, "--json")
     result = completed("convert", model_of(tmp_path, capture), out, "--to", "nerfcli", *options)
-    again = load(out, UserInputs(), Convention())[2]
+    again = parse(out)
     centres = np.array([frame.centre for frame in again.frames])
     np.testing.assert_allclose(centres.mean(axis=0), 0, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(centres[0] - centres[1]), metres, rtol=1e-12)
@@ -409,15 +409,6 @@ def test_photos_of_a_model_are_found_whatever_its_names_are_relative_to(prefix, 
     completed("convert", tmp_path, tmp_path / "elsewhere" / "transforms.json", "--to", "transforms")
     content = json.loads((tmp_path / "elsewhere" / "transforms.json").read_text())
     assert content["frames"][0]["file_path"] == "../images/photo 00.png"
-
-
-def test_the_message_names_what_most_captures_have_and_the_command_that_lists_the_rest(tmp_path):
-    (tmp_path / "notes.md").write_text("hello")
-    with pytest.raises(UserError, match="contains no capture in a supported format") as caught:
-        recognise(tmp_path)
-    assert "transforms.json" in caught.value.hint
-    assert "nerfcli convert --help" in caught.value.hint
-    assert len(caught.value.hint) < 160
 
 
 def test_help_names_all_formats():

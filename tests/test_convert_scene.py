@@ -9,18 +9,17 @@ import numpy as np
 import pytest
 from captures import put_photos, reprojection_px, with_photos
 from commands import completed, error_of, listing, nerfcli, refusal
+from every_format import parse
 from PIL import Image
 from test_convert import LIMIT_PX, model_of
 from test_scale import photos_of, sheet_of_markers
 from views import BROWN, PINHOLE, PRISM, capture_of
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.captures.axes import Convention
 from nerfcli.captures.capture import Capture
-from nerfcli.captures.conversion import TargetOptions, convert, load
+from nerfcli.captures.conversion import TargetOptions, convert
 from nerfcli.captures.formats import colmap_binary
 from nerfcli.captures.formats.colmap import write_colmap_binary, write_colmap_text
-from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.registry import format_named
 from nerfcli.captures.formats.scene_folder import write_scene
 from nerfcli.captures.formats.transforms import write_transforms
@@ -103,7 +102,7 @@ def test_a_known_distance_reaches_training_as_metres(tmp_path):
     np.testing.assert_allclose(scene.points, scale * capture.points, rtol=0, atol=1e-12)
     assert json.loads(nerfcli("info", tmp_path / "my scene", "--json").stdout)["unit"] == "metre"
     assert nerfcli("convert", tmp_path / "my scene", tmp_path / "again", "--to", "nerfcli").exit_code == 0
-    again = load(tmp_path / "again", UserInputs(), Convention())[2]
+    again = parse(tmp_path / "again")
     assert (again.unit, again.unit_source, again.pixels) == ("metre", "1 known distance", "upright")
 
 
@@ -167,7 +166,7 @@ def test_cameras_of_a_scene_are_for_upright_photos(camera, tmp_path):
     result = completed("convert", tmp_path, tmp_path / "scene", "--to", "nerfcli")
     assert "3 photos have an EXIF orientation: the cameras refer to pixels upright" in result.stderr
     scene = load_scene(tmp_path / "scene")
-    _, _, parsed = load(tmp_path / "scene", UserInputs(), Convention())
+    parsed = parse(tmp_path / "scene")
     assert parsed.observations is not None
     for index, frame in enumerate(scene.frames):
         assert frame.image is not None
@@ -199,7 +198,7 @@ def test_other_programs_get_cameras_for_the_pixels_as_they_are_stored(form, plac
     options = ("--pixels", "stored", "--allow-loss")
     result = completed("convert", tmp_path / "scene", tmp_path / place, "--to", form, *options)
     assert "3 photos have an EXIF orientation: the cameras refer to pixels as stored" in result.stderr
-    assert reprojection_px(capture, load(tmp_path / place, UserInputs(), Convention())[2]) < LIMIT_PX
+    assert reprojection_px(capture, parse(tmp_path / place)) < LIMIT_PX
     if form in ("colmap", "colmap-text", "transforms"):
         trained = load_scene(tmp_path)
         assert trained.kind == form.removesuffix("-text")
@@ -211,7 +210,7 @@ def test_which_pixels_can_be_chosen(tmp_path):
     write_scene(in_pixels(capture, "upright").capture, tmp_path / "scene")
     options = ("--to", "colmap", "--pixels", "upright", "--allow-loss")
     assert nerfcli("convert", tmp_path / "scene", tmp_path / "out", *options).exit_code == 0
-    assert load(tmp_path / "out", UserInputs(), Convention())[2].frames[0].camera.width == PINHOLE.height
+    assert parse(tmp_path / "out").frames[0].camera.width == PINHOLE.height
     for pixels in ("stored", "lying"):
         options = ("--to", "nerfcli", "--pixels", pixels)
         assert nerfcli("convert", tmp_path / "scene", tmp_path / "2", *options).exit_code == USAGE
@@ -258,7 +257,7 @@ def test_a_split_is_kept_and_else_every_eighth_photo_is_held_out(splits, test, t
     names = [frame.name for frame in capture.frames]
     assert [frame.name for frame in scene.test_frames] == [names[i] for i in test]
     assert [frame.name for frame in scene.train_frames] == [names[i] for i in train]
-    _, _, again = load(tmp_path / "scene", UserInputs(), Convention())
+    again = parse(tmp_path / "scene")
     expected = splits if any(splits) else tuple("test" if i in test else "train" for i in range(6))
     assert tuple(frame.split for frame in again.frames) == expected
 

@@ -7,19 +7,14 @@ import numpy as np
 import pytest
 from captures import refused
 from every_format import WITH_PHOTOS, Views, change_json, matrix_text, parse, text
-from scipy.spatial.transform import Rotation
+from test_every_format import POSES
+from test_every_format import TWO_FOCAL_LENGTHS as CAMERA
 
-from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.registry import recognise
 from nerfcli.errors import UserError
 
-SIZE = (64, 48)
-CAMERA = Camera("PINHOLE", *SIZE, (70.0, 71.5, 30.25, 25.5))
-ROTATIONS = Rotation.from_rotvec([[0.1, -0.4, 0.2], [1.3, 0.2, -0.7], [-0.5, 2.1, 0.3]])
-CENTRES = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 2.0], [0.1, -3.0, 1.5]])
-POSES = rigid.from_parts(ROTATIONS.as_matrix(), CENTRES)  # world_from_cam, OpenCV axes
 VIEWS = Views(CAMERA, POSES)
 NAMES = ("pose-files", "mvsnet", "neus", "polycam", "record3d")
 
@@ -90,7 +85,7 @@ class TestPoseFiles:
         with pytest.raises(UserError, match=r"has poses but no file of intrinsics") as caught:
             parse(tmp_path)
         assert "--intrinsics" in caught.value.hint
-        twice = CAMERA.resized(2 * SIZE[0], 2 * SIZE[1])
+        twice = CAMERA.resized(128, 96)
         capture = parse(tmp_path, UserInputs(camera=twice))
         assert [frame.name for frame in capture.frames] == [f"frame-{index:06d}.color.png" for index in range(3)]
         np.testing.assert_allclose([frame.world_from_cam for frame in capture.frames], POSES, rtol=0, atol=1e-13)

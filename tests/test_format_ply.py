@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
-from captures import CAMERAS, ring
+from captures import CAMERAS, refused, ring
 
 from nerfcli.captures.formats.colmap import write_colmap_binary
 from nerfcli.captures.formats.ply import read_points, write_points
-from nerfcli.errors import UserError
 
 POINTS = np.array([[1.5, -2.0, 3.0], [4.0, 5.0, -6.25]])
 COLOURS = np.array([[255, 128, 0], [1, 2, 3]], dtype=np.uint8)
@@ -112,6 +111,5 @@ def test_points_that_colmap_exports(tmp_path):
 )
 def test_what_is_no_cloud_is_refused(tmp_path, data, what):
     (tmp_path / "a.ply").write_bytes(data)
-    with pytest.raises(UserError, match=what) as caught:
+    with refused(what, tmp_path / "a.ply"):
         read_points(tmp_path / "a.ply")
-    assert str(tmp_path / "a.ply") in caught.value.message
