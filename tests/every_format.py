@@ -20,7 +20,7 @@ from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.registry import format_named, recognise
 from nerfcli.captures.formats.run_cameras import write_cameras
 
-OPENGL = np.diag([1.0, -1.0, -1.0])
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,9 @@ class Views:
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
     @property
-    def opengl_from_world(self) -> np.ndarray:
-        """The inverses of the poses, with OpenGL axes, (N, 3, 4)."""
-        return OPENGL @ rigid.inverse(self.poses)[:, :3]
+    def opengl_poses(self) -> np.ndarray:
+        """The poses with OpenGL axes, (N, 4, 4)."""
+        return self.poses @ OPENGL
 
     def put(self, index: int, path: Path) -> Path:
         """Put a photo at a path."""
@@ -144,10 +144,9 @@ def write_neus(views: Views, folder: Path) -> Path:
 
 def write_polycam(views: Views, folder: Path) -> Path:
     lens = dict(zip(("fx", "fy", "cx", "cy"), views.camera.params, strict=True))
-    for index, pose in enumerate(views.poses):
+    for index, pose in enumerate(views.opengl_poses):
         views.put(index, folder / f"keyframes/corrected_images/{1000 + index}.jpg")
-        rows = np.column_stack([pose[:3, :3] @ OPENGL, pose[:3, 3]])
-        record = {f"t_{row}{column}": rows[row, column] for row in range(3) for column in range(4)}
+        record = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
         record |= {**lens, "width": views.camera.width, "height": views.camera.height, "blur_score": 71.0}
         text(folder / f"keyframes/corrected_cameras/{1000 + index}.json", json.dumps(record))
     return folder / "keyframes/corrected_cameras/1000.json"
@@ -156,9 +155,8 @@ def write_polycam(views: Views, folder: Path) -> Path:
 def write_record3d(views: Views, folder: Path) -> Path:
     for index in range(len(views.poses)):
         views.put(index, folder / f"rgb/{index}.jpg")
-    quaternions = Rotation.from_matrix(views.poses[:, :3, :3] @ OPENGL).as_quat()  # qx, qy, qz, qw first
     content = {
-        "poses": np.concatenate([quaternions, views.poses[:, :3, 3]], axis=1).tolist(),
+        "poses": quaternion_rows(views.opengl_poses)[:, [3, 4, 5, 6, 0, 1, 2]].tolist(),  # qx, qy, qz, qw first
         "K": views.matrix.T.ravel().tolist(),  # by columns
         "w": views.camera.width,
         "h": views.camera.height,
@@ -208,7 +206,7 @@ def write_reality_capture(views: Views, folder: Path) -> Path:
     (width, height), (f, _, cx, cy) = views.camera.size, views.camera.params
     lens = np.array([36 * f, cx - width / 2, cy - height / 2, 0, 0, 0, 0, 0, 0]) / max(width, height)
     for frame in views.frames(folder):
-        turn = Rotation.from_matrix(frame.world_from_cam[:3, :3] @ OPENGL).as_euler("ZXY", degrees=True)
+        turn = Rotation.from_matrix((frame.world_from_cam @ OPENGL)[:3, :3]).as_euler("ZXY", degrees=True)
         values = np.concatenate([frame.centre, turn * [-1, 1, 1], lens])
         rows.append(",".join([f"images/{frame.name}", *map(repr, values.tolist())]))
     return text(folder / "cameras.csv", "\n".join(rows) + "\n")
@@ -218,7 +216,7 @@ def write_bundler(views: Views, folder: Path) -> Path:
     """A camera of Bundler has one focal length, and its principal point in the middle."""
     text(folder / "list.txt", "".join(f"images/{frame.name}\n" for frame in views.frames(folder)))
     lines = ["# Bundle file v0.3", f"{len(views.poses)} 0"]
-    for pose in views.opengl_from_world:
+    for pose in rigid.inverse(views.opengl_poses)[:, :3]:
         lines += [f"{views.camera.params[0]!r} 0 0", *map(numbers, pose[:, :3]), numbers(pose[:, 3])]
     return text(folder / "bundle.out", "\n".join(lines) + "\n")
 
@@ -295,11 +293,9 @@ def write_stray_scanner(views: Views, folder: Path) -> Path:
 
 
 def write_scanner_app(views: Views, folder: Path) -> Path:
-    for index, pose in enumerate(views.poses):
+    for index, pose in enumerate(views.opengl_poses):
         views.put(index, folder / f"frame_{index:05d}.jpg")
-        matrix = pose.copy()
-        matrix[:3, :3] = pose[:3, :3] @ OPENGL
-        content = {"cameraPoseARFrame": matrix.ravel().tolist(), "intrinsics": views.matrix.ravel().tolist()}
+        content = {"cameraPoseARFrame": pose.ravel().tolist(), "intrinsics": views.matrix.ravel().tolist()}
         text(folder / f"frame_{index:05d}.json", json.dumps(content | {"frame_index": index, "motionQuality": 1}))
     return folder / "frame_00000.json"
 
@@ -352,12 +348,9 @@ def write_scannetpp(views: Views, folder: Path) -> Path:
     """The released photos are of a fisheye lens; here their distortion is zero, and the lens of a pinhole camera."""
     (w, h), (fx, fy, cx, cy) = views.camera.size, views.camera.params
     frames = []
-    for index, pose in enumerate(views.poses):
+    for index, pose in enumerate(views.opengl_poses):
         views.put(index, folder / f"dslr/resized_images/DSC{index:05d}.jpg")
-        matrix = pose.copy()
-        matrix[:3, :3] = pose[:3, :3] @ OPENGL
-        record = {"file_path": f"DSC{index:05d}.jpg", "is_bad": False}
-        frames.append(record | {"transform_matrix": matrix.tolist()})
+        frames.append({"file_path": f"DSC{index:05d}.jpg", "is_bad": False, "transform_matrix": pose.tolist()})
     content = {"w": w, "h": h, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "camera_model": "PINHOLE"}
     content |= {"frames": frames[1:], "test_frames": frames[:1]}
     return text(folder / "dslr/nerfstudio/transforms.json", json.dumps(content))

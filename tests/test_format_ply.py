@@ -13,6 +13,7 @@ from nerfcli.captures.formats.ply import read_points, write_points
 
 POINTS = np.array([[1.5, -2.0, 3.0], [4.0, 5.0, -6.25]])
 COLOURS = np.array([[255, 128, 0], [1, 2, 3]], dtype=np.uint8)
+XYZ, LIST = [f"property float {name}" for name in "xyz"], "property list uchar int vertex_indices"
 
 
 def header(encoding: str, *lines: str) -> bytes:
@@ -27,7 +28,7 @@ def by_hand(encoding: str) -> bytes:
         *("element camera 1", "property float fov"),
         *("element vertex 2", "property uchar red", "property double z", "property uchar blue", "property float x"),
         *("property short quality", "property float y", "property uint8 green"),
-        *("element face 1", "property list uchar int vertex_indices"),
+        *("element face 1", LIST),
     )
     if encoding == "ascii":
         return start + b"0.9\n255 3.0 0 1.5 7 -2 128\n1 -6.25 3 4 7 5.0 2\n3 0 1 0\n"
@@ -57,7 +58,7 @@ def test_colours_as_floats_and_none(tmp_path):
     start = header("ascii", "element vertex 1", *(f"property float {name}" for name in names[:5]))
     (tmp_path / "a.ply").write_bytes(start + b"1 2 3 1.0 0.5\n")
     assert read_points(tmp_path / "a.ply")[1] is None
-    (tmp_path / "a.ply").write_bytes(header("ascii", "element vertex 0", *(f"property float {n}" for n in "xyz")))
+    (tmp_path / "a.ply").write_bytes(header("ascii", "element vertex 0", *XYZ))
     assert read_points(tmp_path / "a.ply")[0].shape == (0, 3)
 
 
@@ -94,18 +95,10 @@ def test_points_that_colmap_exports(tmp_path):
         (header("ascii", "element face 1", "property float x"), "no element vertex"),
         (header("ascii", "element vertex 1", "property float x") + b"1\n", "vertices have the properties x"),
         (header("ascii", "element vertex many"), "has the line 'element vertex many'"),
-        (header("ascii", "element vertex 1", *(f"property float {n}" for n in "xyz")) + b"1 2\n", "fewer than 3"),
-        (header("ascii", "element vertex 9", *(f"property float {n}" for n in "xyz")) + b"1 2 3\n", "1 lines are"),
-        (
-            header("binary_little_endian", "element vertex 999999999999", *(f"property float {n}" for n in "xyz")),
-            "announces 999999999999 vertices, but 0 bytes",
-        ),
-        (
-            header("binary_little_endian", "element a 1", "property list uchar int b", "element vertex 0").replace(
-                b"end_header", b"property float x\nproperty float y\nproperty float z\nend_header"
-            ),
-            "element a contains lists",
-        ),
+        (header("ascii", "element vertex 1", *XYZ) + b"1 2\n", "fewer than 3"),
+        (header("ascii", "element vertex 9", *XYZ) + b"1 2 3\n", "1 lines are"),
+        (header("binary_little_endian", "element vertex 999999999999", *XYZ), "announces 999999999999 vertices, but 0"),
+        (header("binary_little_endian", "element a 1", LIST, "element vertex 0", *XYZ), "element a contains lists"),
         (header("pdf", "element vertex 0"), "its format is 'pdf'"),
     ],
 )

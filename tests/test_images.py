@@ -473,13 +473,6 @@ def test_downscale_is_the_mean_over_areas_by_double_loop(factor, shape):
     assert np.abs(small - expected).max() <= 0.5 + 1e-4  # rounding, and float32 sums
 
 
-def test_downscale_keeps_hidden_colours_hidden():
-    image = np.zeros((2, 2, 4), np.uint8)
-    image[..., :3] = (0, 255, 0)
-    image[0, 0] = (200, 10, 30, 255)
-    np.testing.assert_array_equal(downscale(image, 2), [[[200, 10, 30, 64]]])
-
-
 def test_downscale_of_grey_masks():
     mask = noise(6, 9)
     expected = downscaled_by_loops(np.repeat(mask[..., None], 3, axis=2), 3)[..., 0]
