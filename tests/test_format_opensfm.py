@@ -156,7 +156,7 @@ SHOT = reconstruction()["shots"]["a.jpg"]
         ({"cameras": {"v2 phone": {**CAMERA, "width": 0.5}}}, "width and height are 0.5 and 480"),
         ({"cameras": {"v2 phone": {**CAMERA, "width": 1e12}}}, "width and height are"),
         ({"cameras": {"v2 phone": {**CAMERA, "projection_type": "dual"}}}, "'dual' is not supported"),
-        ({"cameras": {"v2 phone": {**CAMERA, "projection_type": "spherical"}}}, "EQUIRECTANGULAR picture: 640x480"),
+        ({"cameras": {"v2 phone": {**CAMERA, "projection_type": "spherical"}}}, "invalid size .* picture: 640x480"),
         (
             {"cameras": {"v2 phone": {**CAMERA, **RECORDS["fisheye624"], "projection_type": "fisheye624", "k6": 1}}},
             "k5, k6, s1 or s3 beside p1",

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -527,8 +528,8 @@ def test_positions_in_exif_give_the_scale(tmp_path):
         Image.new("RGB", (64, 48)).save(path, exif=exif)
         pose = rigid.from_parts(np.diag([1.0, -1, -1]), np.array([north, -east, 3.0]) / 10)
         frames.append(Frame(path.name, Camera.pinhole(64, 48, 50.0), pose, image=path))
-    Image.new("RGB", (64, 48)).save(tmp_path / "without.jpg")  # it has no position
-    frames.append(Frame("without.jpg", Camera.pinhole(64, 48, 50.0), pose, image=tmp_path / "without.jpg"))
+    Image.new("RGB", (64, 48)).save(tmp_path / "without.jpg")  # it has no position; and one photo is missing
+    frames += [replace(frames[0], name=name, image=None) for name in ("without.jpg", "missing.jpg")]
     write_colmap_binary(Capture(tuple(frames), np.zeros((0, 3)), (), None, "made"), tmp_path / "in")
     done = completed("convert", tmp_path / "in", tmp_path / "out", "--to", "nerfcli", "--scale", "gps", "--json")
     assert json.loads(done.stdout)["scale"]["metres_per_unit"] == pytest.approx(10.0, rel=2e-3)
