@@ -243,10 +243,8 @@ class NewtonSteps(nn.Module):
     def __init__(self, count: int, picture_px: Tensor):
         super().__init__()
         self._picture_px = picture_px
-        self.curvature: Tensor
-        self.weight: Tensor
-        self.register_buffer("curvature", torch.zeros(count, 6, 6, dtype=torch.float64))
-        self.register_buffer("weight", torch.zeros((), dtype=torch.float64))
+        self.curvature = nn.Buffer(torch.zeros(count, 6, 6, dtype=torch.float64))
+        self.weight = nn.Buffer(torch.zeros((), dtype=torch.float64))
 
     def learn(self, gradients: Tensor, losses: Tensor, photos: Tensor) -> Tensor:
         """Update the curvature from some rays, and return the sum (P, 6) of their gradients.
@@ -307,17 +305,14 @@ class WhitenedAdam(nn.Module):
         super().__init__()
         self._whitenings = torch.from_numpy(whitenings)
         shape = whitenings.shape[:2]
-        self.first: Tensor
-        self.second: Tensor
-        self.steps: Tensor
-        self.register_buffer("first", torch.zeros(shape, dtype=torch.float64))
-        self.register_buffer("second", torch.zeros(shape, dtype=torch.float64))
-        self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
+        self.first = nn.Buffer(torch.zeros(shape, dtype=torch.float64))
+        self.second = nn.Buffer(torch.zeros(shape, dtype=torch.float64))
+        self.steps = nn.Buffer(torch.zeros((), dtype=torch.int64))
 
     def change(self, gradient: Tensor, rate: float) -> Tensor:
         """Return the change (N, K) of the parameters for their gradient (N, K)."""
         white = (self._whitenings @ gradient[..., None])[..., 0]  # symmetric: its own transpose
-        self.steps += 1
+        self.steps.add_(1)
         self.first.lerp_(white, 1 - BETAS[0])
         self.second.lerp_(white.square(), 1 - BETAS[1])
         steps = int(self.steps)

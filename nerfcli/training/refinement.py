@@ -37,8 +37,7 @@ class PoseRefinement(nn.Module):
     def __init__(self, poses: np.ndarray, cameras: Sequence[Camera]):
         super().__init__()
         self._given = poses
-        self.motions: Tensor
-        self.register_buffer("motions", torch.eye(4, dtype=torch.float64).repeat(len(poses), 1, 1))
+        self.motions = nn.Buffer(torch.eye(4, dtype=torch.float64).repeat(len(poses), 1, 1))
         at_one = {camera: _picture_by_twist(camera) for camera in dict.fromkeys(cameras)}
         distances = np.linalg.norm(poses[:, :3, 3], axis=1).clip(_LEAST_DISTANCE)
         # The effect of a translation on the picture decreases with the distance, that of a rotation does not.
@@ -118,8 +117,7 @@ class LensRefinement(nn.Module):
         self._turns = pool.poses[:, :3, :3].double().cpu()
         self._names = names
         self._own = [tuple(name for name in names if name in changeable(camera)) for camera in self._cameras]
-        self.values: Tensor
-        self.register_buffer("values", torch.zeros(len(lenses), len(names), dtype=torch.float64))
+        self.values = nn.Buffer(torch.zeros(len(lenses), len(names), dtype=torch.float64))
         for index, own in enumerate(self._own):
             if FOCAL in own:
                 self.values[self._lens_of[index], names.index(FOCAL)] = log_focal
@@ -130,9 +128,6 @@ class LensRefinement(nn.Module):
         """Return `camera`, that of a photo, with the current changes; its pictures may have another size."""
         return self._changed(camera, int(self._camera_of[photo]))
 
-    def _now(self, index: int) -> Camera:
-        return self._changed(self._cameras[index], index)
-
     def _changed(self, camera: Camera, index: int) -> Camera:
         own = [self._names.index(name) for name in self._own[index]]
         return changed(camera, self._own[index], self.values[self._lens_of[index], own].numpy())
@@ -142,7 +137,7 @@ class LensRefinement(nn.Module):
         numbers, photos = torch.stack([drawn.numbers, photos]).cpu()  # with a GPU, the host waits for this
         changed = torch.full(drawn.directions.shape, torch.nan, dtype=drawn.directions.dtype)
         for index, rays, pixels in self._by_camera(numbers, photos):
-            bearings, valid = self._now(index).bearings(pixels)
+            bearings, valid = self._changed(self._cameras[index], index).bearings(pixels)
             there = rays[torch.from_numpy(valid)]  # elsewhere, the given lens is better than none
             turned = self._turns[photos[there]] @ torch.from_numpy(bearings[valid])[..., None]
             changed[there] = turned[..., 0].to(changed.dtype)
@@ -157,7 +152,8 @@ class LensRefinement(nn.Module):
         gradient = torch.zeros_like(self.values)
         for index, rays, pixels in self._by_camera(numbers, photos):
             names = self._own[index]
-            by_change = torch.from_numpy(bearings_by_change(self._now(index), names, pixels))
+            camera = self._changed(self._cameras[index], index)
+            by_change = torch.from_numpy(bearings_by_change(camera, names, pixels))
             by_bearing = turns[photos[rays]].transpose(-1, -2) @ by_direction[rays][..., None]
             of = [self._names.index(name) for name in names]
             gradient[self._lens_of[index], of] += (by_change * by_bearing).sum((0, 1))
@@ -165,7 +161,7 @@ class LensRefinement(nn.Module):
 
     def step(self, gradient: Tensor, rate: float) -> None:
         """Take one step against a gradient (L, K)."""
-        self.values += self.adam.change(gradient, rate)
+        self.values.add_(self.adam.change(gradient, rate))
 
     def _by_camera(self, numbers: Tensor, photos: Tensor) -> list[tuple[int, Tensor, np.ndarray]]:
         """Return index, rays (N,) and pixels (N, 2) for each camera of the rays' photos (R,) that can change."""
@@ -269,8 +265,9 @@ class Refinement(nn.Module):
 
         def refined(frame: Frame, pose: np.ndarray) -> Frame:
             photo = photo_of.get(frame.camera.centred())
-            camera = frame.camera if photo is None else self._lens(photo, frame.camera)
-            return replace(frame, camera=camera, world_from_cam=pose)
+            if self.lenses is None or photo is None:
+                return replace(frame, world_from_cam=pose)
+            return replace(frame, camera=self.lenses.changed(frame.camera, photo), world_from_cam=pose)
 
         poses = [frame.world_from_cam for frame in training]
         if self.poses is not None:
@@ -281,9 +278,6 @@ class Refinement(nn.Module):
             tuple(refined(frame, pose) for frame, pose in zip(training, poses, strict=True)),
             tuple(refined(frame, frame.world_from_cam) for frame in held_out),
         )
-
-    def _lens(self, photo: int, camera: Camera) -> Camera:
-        return camera if self.lenses is None else self.lenses.changed(camera, photo)
 
 
 def _picture_by_twist(camera: Camera) -> np.ndarray:
