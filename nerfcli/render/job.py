@@ -155,14 +155,6 @@ def file_names(frames: Sequence[Frame]) -> list[str]:
     return [stem if taken[stem] == 1 + (stem == name) else name for stem, name in zip(stems, names, strict=True)]
 
 
-def describe_frames(frames: Sequence[Frame]) -> list[dict[str, Any]]:
-    """Return files, cameras and poses of the pictures, as stored in render.json."""
-    return [
-        {"file": name, "camera": frame.camera.to_json(), "world_from_cam": frame.world_from_cam.tolist()}
-        for frame, name in zip(frames, file_names(frames), strict=True)
-    ]
-
-
 def with_suffix(stem: Path, suffix: str) -> Path:
     """Add a suffix to a name; an existing suffix is kept, since it distinguishes a.jpg from a.png."""
     return stem.with_name(stem.name + suffix)
@@ -197,12 +189,12 @@ class RenderJob:
 
     def key(self) -> dict[str, Any]:
         """Return everything that determines the rendered numbers, as plain values."""
-        return {
-            "nerfcli": __version__,
-            "settings": self.settings.pixel_settings(),
-            "frames": describe_frames(self.frames),
-            **self.provenance,
-        }
+        frames = [
+            {"file": name, "camera": frame.camera.to_json(), "world_from_cam": frame.world_from_cam.tolist()}
+            for frame, name in zip(self.frames, self.names, strict=True)
+        ]
+        settings = self.settings.pixel_settings()
+        return {"nerfcli": __version__, "settings": settings, "frames": frames, **self.provenance}
 
     @cached_property
     def digest(self) -> str:
