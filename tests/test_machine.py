@@ -60,9 +60,8 @@ def test_a_benchmark_names_the_gpu_and_reads_its_memory(monkeypatch):
     monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda device: None)
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: {"cuda:1": 7}[device])
     assert measurement.describe_machine("cuda:1", 2)["device"] == "GPU of cuda:1"
-    memory = measurement.PeakMemory("cuda:1")
-    memory.begin()
-    assert memory.read() == 7
+    measurement.begin_peak("cuda:1")
+    assert measurement.peak_bytes("cuda:1") == 7
 
 
 def test_a_gpu_gets_larger_steps_and_tables():

@@ -157,24 +157,17 @@ def is_busy(load: float | None) -> bool:
     return load is not None and load > 0.25 * (os.cpu_count() or 1)
 
 
-@dataclass(frozen=True)
-class PeakMemory:
-    """Peak memory since `begin`, of this process or, if the device is a GPU, of the GPU."""
+def begin_peak(device: str) -> None:
+    """Reset the peak memory of this process or, if the device is a GPU, of the GPU."""
+    if device != "cpu":
+        torch.cuda.reset_peak_memory_stats(device)
+    else:
+        machine.begin_recent_peak()
 
-    device: str
 
-    def begin(self) -> None:
-        """Reset the peak."""
-        if self.device != "cpu":
-            torch.cuda.reset_peak_memory_stats(self.device)
-        else:
-            machine.begin_recent_peak()
-
-    def read(self) -> int | None:
-        """Return the peak in bytes; None if the system does not report it."""
-        if self.device != "cpu":
-            return torch.cuda.max_memory_allocated(self.device)
-        return machine.recent_peak_bytes()
+def peak_bytes(device: str) -> int | None:
+    """Return the peak since `begin_peak`; None if the system does not report it."""
+    return machine.recent_peak_bytes() if device == "cpu" else torch.cuda.max_memory_allocated(device)
 
 
 MOST_PHOTOS = 3
@@ -225,7 +218,6 @@ def measure_renderings(run: Run, *, resources: Resources, seconds: float, save: 
             break
         tell(spent(), f"rendering: {setting.name(settings[0])}")
         pictures[setting] = _errors(model, photos, converged, setting)
-    memory = PeakMemory(device)
     taken: dict[RenderSetting, list[float]] = {setting: [] for setting in pictures}
     peaks: dict[RenderSetting, int | None] = {}
     for number in range(MOST_ROUNDS):
@@ -235,9 +227,9 @@ def measure_renderings(run: Run, *, resources: Resources, seconds: float, save: 
         random.Random(number).shuffle(order)
         for setting in order:
             tell(spent(), f"timing, round {number + 1}: {setting.name(settings[0])}")
-            memory.begin()
+            begin_peak(device)
             taken[setting].append(_timed(model, photos, setting))
-            peaks[setting] = memory.read()
+            peaks[setting] = peak_bytes(device)
         save(
             [
                 Point(
@@ -267,13 +259,13 @@ def measure_trainings(
     base = TrainSettings(device=device, threads=resources.cores)
     chosen, unit = affordable(train_settings(), seconds, overhead=6.0)
     points: list[Point] = []
-    memory, folder = PeakMemory(device), work / WORK
+    folder = work / WORK
     for number, setting in enumerate(chosen):
 
         def on_progress(progress: Progress, number: int = number, name: str = setting.name) -> None:
             tell((number + progress.fraction) / len(chosen), f"training: {name}, step {progress.step}")
 
-        memory.begin()
+        begin_peak(device)
         shutil.rmtree(folder, ignore_errors=True)
         try:
             wanted = setting.settings(base, unit)
@@ -285,8 +277,8 @@ def measure_trainings(
             shutil.rmtree(folder, ignore_errors=True)
         assert summary is not None
         decibels = SampledPixels.drawn(photos, seed=0).psnr(model)
-        taken = spread([summary.seconds])
-        points.append(Point(setting.name, **taken, peak_memory_bytes=memory.read(), psnr=decibels, steps=summary.steps))
+        taken, peak = spread([summary.seconds]), peak_bytes(device)
+        points.append(Point(setting.name, **taken, peak_memory_bytes=peak, psnr=decibels, steps=summary.steps))
         save(points)
 
 
