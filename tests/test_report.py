@@ -3,6 +3,7 @@
 import html
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 from browser import Browser, needs_browser
 from fog import fog, foggy_cells
 from markupsafe import escape
+from present import present
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -86,27 +88,33 @@ def facts(label: str = "a run", **changes: Any) -> RunFacts:
     return replace(run, **changes)
 
 
+PHOTO = np.full((8, 10, 3), 128, np.uint8)
+MODEL = fog(
+    foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32
+)
+
+
 @pytest.fixture(scope="module")
-def seen() -> tuple[list[HeldOutRenderings], np.ndarray]:
-    """Return views of a cube of fog from the poses of held-out grey photos, and the photo."""
-    cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-    model = fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32)
-    photo = np.full((8, 10, 3), 128, np.uint8)
+def look() -> list[HeldOutRenderings]:
+    """Return views of a cube of fog from the poses of held-out grey photos."""
     fractions: list[float] = []
-    held_out = [HeldOutPhoto(camera_at(name, (0.0, 0.0, -2.0)), photo, None) for name in ("a.png", EVIL)]
-    photos = depth_maps(model, [camera_at("c.png", (0.0, 0.0, -2.0)), camera_at("d.png", (0.0, 0.0, 2.0))])
-    look = look_through(model, held_out, depth=DEPTH, photo_depths=photos, on_progress=fractions.append)
+    held_out = [HeldOutPhoto(camera_at(name, (0.0, 0.0, -2.0)), PHOTO, None) for name in ("a.png", EVIL)]
+    photos = depth_maps(MODEL, [camera_at("c.png", (0.0, 0.0, -2.0)), camera_at("d.png", (0.0, 0.0, 2.0))])
+    look = look_through(MODEL, held_out, depth=DEPTH, photo_depths=photos, on_progress=fractions.append)
     assert fractions == [0.5, 1.0]
-    return look, photo
+    return look
 
 
-def test_views_hold_the_photo_and_what_the_field_shows_of_it(seen):
-    look, photo = seen
+def page_of(*runs: RunFacts, looks: Sequence[list[HeldOutRenderings]]) -> str:
+    return page_html(runs, looks, depths=[depth_meta(MODEL, DEPTH)] * len(runs))
+
+
+def test_views_hold_the_photo_and_what_the_field_shows_of_it(look):
     view = look[0]
-    np.testing.assert_array_equal(view.photo, photo)
+    np.testing.assert_array_equal(view.photo, PHOTO)
     assert view.picture.shape == view.error.shape == (8, 10, 3)
     np.testing.assert_array_equal(view.picture[0, 0], np.rint(np.array([0.2, 0.4, 0.6]) * 255))  # beside the cube
-    difference = (view.picture.astype(float) - photo) / 255.0
+    difference = (view.picture.astype(float) - PHOTO) / 255.0
     assert view.metrics.psnr == pytest.approx(-10 * np.log10(np.square(difference).mean()), abs=1e-9)
     assert 0.0 < view.with_depth < 1.0
     assert view.with_depth == np.isfinite(view.depth).mean()
@@ -152,13 +160,11 @@ def test_runs_are_shown_by_photos_that_all_of_them_hold_out():
 
 def layers_in(page: str) -> list[list[dict[str, Any]]]:
     data = re.search(r'<script type="application/json" id="views">(.*?)</script>', page, re.DOTALL)
-    assert data is not None
-    return json.loads(data[1])
+    return json.loads(present(data)[1])
 
 
-def test_the_page_shows_the_numbers_and_embeds_the_pictures(seen):
-    look, _ = seen
-    text = page_html([facts()], [look], depths=[_meta()])
+def test_the_page_shows_the_numbers_and_embeds_the_pictures(look):
+    text = page_of(facts(), looks=[look])
     for number in ("23.46 dB", "0.7500", "1.50 M", "0.25 s", "8.0 MB", "200 MB", ">20<"):
         assert number in text
     assert "conditional depth along the optical" in text
@@ -177,34 +183,31 @@ def test_a_run_that_shares_photos_with_two_others_joins_their_captures():
     assert captures_of(runs) == [[0, 1, 3], [2]]
 
 
-def two_captures(seen: tuple[list[HeldOutRenderings], np.ndarray]) -> str:
+def two_captures(look: list[HeldOutRenderings]) -> str:
     """A page about two runs of one capture and one of another, whose photo has the same name."""
-    look, _ = seen
 
     def holding(label: str, image: str, psnr: float) -> RunFacts:
         frame = replace(camera_at("a.png", (0, 0, -2)), image=Path(image))
         run = facts(label, frames=RunCameras((), (frame,)))
-        assert run.metrics is not None
-        return replace(run, metrics=replace(run.metrics, mean=Metrics(psnr)))
+        return replace(run, metrics=replace(present(run.metrics), mean=Metrics(psnr)))
 
     runs = [holding("one", "x/a.png", 9.5), holding("two", "y/a.png", 30.0), holding("three", "x/a.png", 25.0)]
     assert captures_of(runs) == [[0, 2], [1]]
-    return page_html(runs, [look] * 3, depths=[_meta()] * 3)
+    return page_of(*runs, looks=[look] * 3)
 
 
-def test_photos_of_the_same_name_in_two_captures_stay_apart(seen):
-    text = two_captures(seen)
+def test_photos_of_the_same_name_in_two_captures_stay_apart(look):
+    text = two_captures(look)
     rendered = [[layer["label"] for layer in view if "rendered" in layer["label"]] for view in layers_in(text)]
-    assert rendered == [["one: rendered", "three: rendered"]] * len(seen[0]) + [["two: rendered"]] * len(seen[0])
+    assert rendered == [["one: rendered", "three: rendered"]] * len(look) + [["two: rendered"]] * len(look)
     assert "different held-out photos" not in text
     assert text.count('<img class="thumbnail"') == 3
-    look, _ = seen
-    assert 'class="thumbnail"' not in page_html([facts(), facts()], [look, look], depths=[_meta()] * 2)
+    assert 'class="thumbnail"' not in page_of(facts(), facts(), looks=[look, look])
 
 
 @needs_browser
-def test_captures_are_sorted_by_a_click(seen, tmp_path):
-    (tmp_path / "page.html").write_text(two_captures(seen), encoding="utf-8")
+def test_captures_are_sorted_by_a_click(look, tmp_path):
+    (tmp_path / "page.html").write_text(two_captures(look), encoding="utf-8")
     with Browser(tmp_path / "profile") as browser:
         browser.send("Page.navigate", url=(tmp_path / "page.html").resolve().as_uri())
         browser.wait("document.readyState == 'complete' && document.querySelectorAll('.sortable').length")
@@ -218,63 +221,55 @@ def test_captures_are_sorted_by_a_click(seen, tmp_path):
         assert not browser.errors
 
 
-def test_what_comes_from_outside_stays_text(seen):
-    look, _ = seen
+def test_what_comes_from_outside_stays_text(look):
     run = facts(EVIL, config=RunConfig(scene=Path(EVIL), versions={EVIL: EVIL}, missing_photos=(EVIL,), unit=EVIL))
-    text = page_html([run], [look], depths=[_meta()])
+    text = page_of(run, looks=[look])
     assert "<script>alert" not in text
     assert "<b>\"'" not in text
     assert escape(EVIL) in text
 
 
-def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
-    look, _ = seen
+def test_runs_stand_side_by_side_and_what_differs_comes_first(look):
     other = facts("another", config=replace(facts().config, settings=TrainSettings(log2_rows=14)))
-    text = page_html([facts(), other], [look, look], depths=[_meta(), _meta()])
+    text = page_of(facts(), other, looks=[look, look])
     assert "differs: settings.log2_rows" in text
     assert "<th class=number>another</th>" in text
     assert text.index("differs: settings.log2_rows") < text.index(">settings.seed<")
     assert "settings.field_memory_bytes" not in text  # what no run states
     assert "another: rendered" in text
     on_gpu = facts("on a GPU", config=replace(facts().config, settings=TrainSettings(device="cuda")))
-    text = page_html([facts(), on_gpu], [look, look], depths=[_meta(), _meta()])
+    text = page_of(facts(), on_gpu, looks=[look, look])
     assert re.search(r"differs: settings.samples_per_step</t.>\s*<td[^>]*>65536</td>\s*<td[^>]*>262144<", text)
     farther = [replace(view, depth=view.depth + 1) for view in look]
     near, both = depth_range(look), depth_range([*look, *farther])
-    assert f"&gt;= {both.high:.3g}" in page_html(
-        [facts(), other], [look, farther], depths=[_meta(), _meta()]
-    )  # one range for a scene
+    assert f"&gt;= {both.high:.3g}" in page_of(facts(), other, looks=[look, farther])  # one range for a scene
     foreign = replace(other, config=RunConfig(scene_fingerprint="x"))
-    assert f"&gt;= {near.high:.3g}" in page_html([facts(), foreign], [look, farther], depths=[_meta(), _meta()])
+    assert f"&gt;= {near.high:.3g}" in page_of(facts(), foreign, looks=[look, farther])
     assert near.low < near.high < both.high
 
 
-def test_the_page_shows_cameras_chosen_components_and_how_new_the_views_are(seen):
-    look, _ = seen
+def test_the_page_shows_cameras_chosen_components_and_how_new_the_views_are(look):
     run = facts()
-    assert run.metrics is not None
     view = Novelty("b.png", 1.0, 0.1234, None, 5.67, "extrapolation")
     metrics = replace(
-        run.metrics,
+        present(run.metrics),
         images=tuple(PhotoMetrics(name, Metrics(19.5), view=view) for name in ("a.png", "b.png", "c.png")),
         ledger=(Entry("poses", True, "all photos were matched"),),
     )
     decision = Decision("view", 0, 0.5, 0.1, None, -0.02, None, True, "so")
     config = replace(run.config, selection=Selection(Components(), (decision,), 1.0))
-    chosen = replace(run, metrics=metrics, config=config)
-    text = page_html([chosen], [look], depths=[_meta()])
+    text = page_of(replace(run, metrics=metrics, config=config), looks=[look])
     for cell in ("0.123", "5.7", "extrapolation", "all photos were matched", "19.50 dB (3)"):
         assert cell in text
     for cell in ("view=0", "+0.50 ± 0.10", "-2%"):
         assert cell in text
-    assert "view=0" not in page_html([run], [look], depths=[_meta()])
+    assert "view=0" not in page_of(run, looks=[look])
 
 
 def test_numbers_that_must_not_be_compared_are_named():
     one = facts()
     assert list(mismatches_of([one, facts("b")])) == []
-    assert one.metrics is not None
-    metrics = replace(one.metrics, protocol="x", device="cuda")
+    metrics = replace(present(one.metrics), protocol="x", device="cuda")
     foreign = replace(one, config=RunConfig(split_sha256="2"), metrics=metrics)
     reported = list(mismatches_of([one, foreign]))
     assert len(reported) == 3
@@ -324,9 +319,8 @@ def test_labels_are_the_shortest_ends_that_differ():
 def test_curves_go_where_their_values_say():
     """On a linear axis, and decades on a logarithmic one; what cannot be drawn is left out."""
     for y, logarithmic in (([0, 5, 10], False), ([1, 10, 100], True)):
-        figure = figures.curves([figures.Curve(0, "a", [0, 1, 2], y)], y_title="y", logarithmic=logarithmic)
-        assert figure is not None
-        (axes,) = figure.axes
+        curve = figures.Curve(0, "a", [0, 1, 2], y)
+        (axes,) = present(figures.curves([curve], y_title="y", logarithmic=logarithmic)).axes
         assert axes.get_yscale() == ("log" if logarithmic else "linear")
         np.testing.assert_array_equal(axes.lines[0].get_xydata(), np.column_stack([[0, 1, 2], y]))
     assert figures.curves([figures.Curve(0, "a", [0.0], [float("nan")])], y_title="y") is None
@@ -334,8 +328,7 @@ def test_curves_go_where_their_values_say():
 
 
 def test_drawings_say_what_they_show_load_nothing_and_are_always_the_same():
-    figure = figures.curves([figures.Curve(0, EVIL, [0.0, 1.0], [1.0, 2.0], dots=True)], y_title="dB")
-    assert figure is not None
+    figure = present(figures.curves([figures.Curve(0, EVIL, [0.0, 1.0], [1.0, 2.0], dots=True)], y_title="dB"))
     drawn = figures.svg(figure)
     assert drawn.startswith("<svg")
     assert "<script>" not in drawn
@@ -355,8 +348,3 @@ def test_a_ring_of_cameras_is_drawn_as_a_ring_whichever_way_it_is_turned():
     radii = np.linalg.norm(np.concatenate([dot.get_xydata() for dot in dots]), axis=1)
     assert radii == pytest.approx(np.full(12, 5.0), rel=1e-9)
     assert [dot.get_color() == figures.LOOK for dot in dots] == [False] * 9 + [True] * 3
-
-
-def _meta() -> Any:
-    cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-    return depth_meta(fog(cells, Similarity.identity(), background=(0, 0, 0), step=1 / 32), DEPTH)
