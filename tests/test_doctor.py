@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from present import present
 from walks import BOARDS, FOCAL_PX, HEIGHT, WIDTH, view, walk, write
 
 from nerfcli.cameras import rigid
@@ -78,9 +79,20 @@ def examined(folder: Path, photos: list[np.ndarray]) -> Examination:
     return Examination(folder, tuple(photos), tuple(facts), tuple(pairs))
 
 
+def examination_of(folder: Path, *, threads: int = 2, calibration: Calibration | None = None) -> Diagnosis:
+    subject = find_subject(folder)
+    return examine(subject, threads=threads, progress=lambda *reported: None, calibration=calibration)
+
+
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory: pytest.TempPathFactory) -> Examination:
     return examined(tmp_path_factory.mktemp("doctor") / "clean", walk())
+
+
+@pytest.fixture(scope="module")
+def exif(clean: Examination) -> Exif:
+    """What a camera with a known lens states about the photos."""
+    return replace(clean.facts[0].exif, make="Maker", model="One", focal_mm=4.0, focal_35mm=28.0)
 
 
 def finding(diagnosis: Diagnosis, check: str) -> Finding:
@@ -152,8 +164,7 @@ def test_doubles_are_named_whether_the_file_is_the_same_or_not(clean, tmp_path):
     assert finding(lighter, "duplicates").photos == (("04.jpg", "same picture as 03.jpg"),)
 
 
-def test_mixed_lenses_and_zooms_are_reported_but_not_a_phone_on_its_side(clean):
-    exif = replace(clean.facts[0].exif, make="Maker", model="One", focal_mm=4.0, focal_35mm=28.0)
+def test_mixed_lenses_and_zooms_are_reported_but_not_a_phone_on_its_side(clean, exif):
 
     def cameras(*odd: Exif) -> Finding:
         return inventory.cameras([replace(f, exif=e) for f, e in zip(clean.facts, [*odd, *[exif] * 6], strict=True)])
@@ -180,8 +191,7 @@ def test_only_photos_with_an_orientation_in_exif_are_said_to_be_turned(clean):
     assert tagged.advice == "nothing to do: nerfcli turns photos upright; other programs may ignore the tag"
 
 
-def test_each_folder_has_a_camera_of_its_own(clean):
-    exif = replace(clean.facts[0].exif, make="Maker", model="One", focal_mm=4.0, focal_35mm=28.0)
+def test_each_folder_has_a_camera_of_its_own(clean, exif):
     other = replace(exif, model="Two")
 
     def cameras(*exifs: Exif) -> Finding:
@@ -197,9 +207,8 @@ def test_each_folder_has_a_camera_of_its_own(clean):
     assert found.summary.startswith("up to 2 different combinations of camera, lens, zoom and image size in each of 2")
 
 
-def test_exif_of_another_picture_is_named(clean):
+def test_exif_of_another_picture_is_named(clean, exif):
     """EXIF records 4032x2268, another shape than the file's; 4032x3024 has the same shape: only downscaled."""
-    exif = replace(clean.facts[0].exif, make="Maker", model="One", focal_mm=4.0, focal_35mm=28.0)
     resized = replace(exif, taken_px=(4032, 3024))
     cropped = replace(exif, taken_px=(4032, 2268))
 
@@ -260,11 +269,8 @@ def test_given_intrinsics_determine_how_far_things_are(tmp_path):
 
     def baseline_over_depth(focal_px: float) -> float:
         calibrated = Calibration(Path("c"), (Camera.pinhole(2 * WIDTH, 2 * HEIGHT, 2 * focal_px),), {})
-        (pair,) = examine(
-            find_subject(folder), threads=1, progress=lambda *reported: None, calibration=calibrated
-        ).pairs
-        assert pair.views is not None
-        return pair.views.baseline_over_depth
+        (pair,) = examination_of(folder, threads=1, calibration=calibrated).pairs
+        return present(pair.views).baseline_over_depth
 
     right = baseline_over_depth(FOCAL_PX)
     assert 0.5 / 6 < right < 0.5 / 2.6
@@ -305,8 +311,7 @@ def test_the_baseline_over_the_depth_is_measured_and_a_pure_rotation_recognized(
     """The true focal length is 700 px; a pure rotation is recognized at any."""
     points, noise = two_view_points()
     x, y = seen(points, 0, (0, 0, 0)) + noise[0], seen(points, turn_deg, (baseline, 0, 0)) + noise[1]
-    views = estimate_motion(x, y, (focal_px, focal_px), within_px=2.0)
-    assert views is not None
+    views = present(estimate_motion(x, y, (focal_px, focal_px), within_px=2.0))
     assert views.flat == (baseline == 0)
     over_depth = baseline / np.median(points[:, 2])
     assert views.baseline_over_depth == pytest.approx(over_depth, rel=0.1, abs=0.02 * views.flat)
@@ -316,8 +321,8 @@ def test_a_plane_gives_no_more_than_its_baseline_over_its_distance():
     """The ratio is 0.2; if the focal length may be 1.45 times the given one, 0.2 / 1.45 explains the same pixels."""
     points, _ = two_view_points()
     flat = np.column_stack([points[:, :2], np.full(len(points), 5.0)])
-    views = estimate_motion(seen(flat, 0, (0, 0, 0)), seen(flat, 0, (1.0, 0, 0)), (700.0, 700.0), within_px=2.0)
-    assert views is not None
+    x, y = seen(flat, 0, (0, 0, 0)), seen(flat, 0, (1.0, 0, 0))
+    views = present(estimate_motion(x, y, (700.0, 700.0), within_px=2.0))
     assert views.flat
     assert 0.2 / 1.46 < views.baseline_over_depth < 0.201
 
@@ -430,17 +435,14 @@ def test_weakly_determined_intrinsics_of_a_scene_are_named(tmp_path):
     weak = {"weak": True, "focal_percent": 4.0, "distortion_border_px": 3.0}
     assert camera_layout.intrinsics(scene) is None
     assert found({"model": "OPENCV"}, {"uncertainty": None}, {"uncertainty": {"weak": None}}) is None
-    good, bad = found({"uncertainty": firm}), found({"uncertainty": firm}, {"uncertainty": weak})
-    assert good is not None
-    assert bad is not None
+    good, bad = map(present, (found({"uncertainty": firm}), found({"uncertainty": firm}, {"uncertainty": weak})))
     assert (good.verdict, good.number) == (GOOD, 0.2)
     assert good.threshold.endswith("look from 1 % of the focal length, or 0.3 % of half the image diagonal")
     assert (bad.verdict, bad.number) == (LOOK, 4.0)
     assert "weakly determined: focal length ± 4 %, distortion ± 3 px at the corners" in bad.summary
     assert "--intrinsics" in bad.advice
     undistorted = found({"uncertainty": firm | {"distortion_border_px": None}})
-    assert undistorted is not None
-    assert undistorted.summary == "focal length ± 0.2 %"
+    assert present(undistorted).summary == "focal length ± 0.2 %"
 
 
 def test_missing_photos_and_masks_that_only_some_have_are_named():
@@ -457,7 +459,7 @@ def test_damaged_files_are_named_and_the_rest_is_examined(clean, tmp_path):
     folder = write(tmp_path / "photos", list(clean.photos[:2]))
     (folder / "cut <b>.jpg").write_bytes((folder / "00.jpg").read_bytes()[:3000])
     (folder / "empty.png").touch()
-    diagnosis = examine(find_subject(folder), threads=2, progress=lambda fraction, detail: None)
+    diagnosis = examination_of(folder)
     found = finding(diagnosis, "files")
     assert (found.verdict, found.names) == (BAD, ("cut <b>.jpg", "empty.png"))
     assert finding(diagnosis, "count").verdict == BAD
@@ -473,7 +475,7 @@ def test_a_check_that_raises_is_listed_and_the_others_are_made(clean, tmp_path, 
 
     monkeypatch.setattr("nerfcli.doctor.geometry.movement", singular)
     monkeypatch.setattr("nerfcli.doctor.quality.stops", singular)
-    diagnosis = examine(find_subject(folder), threads=2, progress=lambda fraction, detail: None)
+    diagnosis = examination_of(folder)
     why = "could not be computed: LinAlgError: singular matrix"
     assert dict(diagnosis.not_checked).items() >= {"movement": why, "stops": why}.items()
     assert finding(diagnosis, "count").verdict == BAD
@@ -485,7 +487,7 @@ def test_a_check_that_raises_is_listed_and_the_others_are_made(clean, tmp_path, 
 
 def test_nothing_readable_is_a_finding_too(tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"no picture")
-    diagnosis = examine(find_subject(tmp_path), threads=1, progress=lambda fraction, detail: None)
+    diagnosis = examination_of(tmp_path, threads=1)
     assert [f.verdict for f in diagnosis.findings] == [BAD, BAD]
     assert "a.jpg" in page_html(diagnosis)
 
@@ -510,8 +512,8 @@ def test_the_page_needs_nothing_else_and_shows_each_photo_once(clean):
 
 def test_the_same_photos_give_the_same_findings(clean, tmp_path):
     folder = write(tmp_path / "again", list(clean.photos[:3]))
-    runs = [content(examine(find_subject(folder), threads=t, progress=lambda fraction, detail: None)) for t in (1, 3)]
-    assert runs[0] == runs[1]
+    one, other = (content(examination_of(folder, threads=threads)) for threads in (1, 3))
+    assert one == other
 
 
 def test_quality_thresholds_are_those_of_the_docstring():

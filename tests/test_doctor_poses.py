@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from present import present
 from test_photos import NO_EXIF
 from walks import FOCAL_PX, HEIGHT, WIDTH, walk, write
 
@@ -83,9 +84,7 @@ def pairs_of(frames: Sequence[Frame]) -> list[Pair]:
 
 def checked(given: Sequence[Frame], pairs: Sequence[Pair]) -> Finding:
     photos = facts(len(given))
-    found = poses_by_matches(photos, pair_errors(given, photos, pairs))
-    assert found is not None
-    return found
+    return present(poses_by_matches(photos, pair_errors(given, photos, pairs)))
 
 
 def posed(frames: Sequence[Frame], poses: dict[int, np.ndarray]) -> list[Frame]:
@@ -244,16 +243,14 @@ def test_a_group_of_photos_on_the_wrong_side_is_named_though_its_photos_agree_wi
     opposite = np.diag([-1.0, -1.0, 1.0, 1.0])
     given = posed(frames, {index: opposite @ frames[index].world_from_cam for index in group})
     assert checked(given, pairs).photos == ()  # each pair agrees
-    found = groups(given, pairs)
-    assert found is not None
+    found = present(groups(given, pairs))
     assert (found.verdict, found.number) == (BAD, 5)
     assert sorted(found.names) == [f"{index}.jpg" for index in group]
 
 
 def test_sound_captures_have_no_misplaced_group():
     frames = ring(36)
-    found = groups(frames, compared_pairs(frames, lambda i, j: True))
-    assert found is not None
+    found = present(groups(frames, compared_pairs(frames, lambda i, j: True)))
     assert (found.verdict, found.photos) == (GOOD, ())
     # Nor has one in two parts far from each other, such as two sides of a wall.
     halves = [
@@ -261,8 +258,7 @@ def test_sound_captures_have_no_misplaced_group():
         for index, frame in enumerate(frames)
     ]
     found = groups(halves, compared_pairs(frames, lambda i, j: (i < 24) == (j < 24)))
-    assert found is not None
-    assert found.photos == ()
+    assert present(found).photos == ()
 
 
 def test_a_group_without_matches_means_nothing_where_neighbours_often_do_not_match():
@@ -273,8 +269,7 @@ def test_a_group_without_matches_means_nothing_where_neighbours_often_do_not_mat
 
 def test_a_single_photo_without_matches_is_no_group():
     frames = ring(36)
-    found = groups(frames, compared_pairs(frames, lambda i, j: 10 not in (i, j)))
-    assert found is not None
+    found = present(groups(frames, compared_pairs(frames, lambda i, j: 10 not in (i, j))))
     assert (found.verdict, found.photos) == (GOOD, ())
 
 
