@@ -172,17 +172,18 @@ def fitting_of(capture: Path, device: Any, batch: int, log2_rows: int) -> tuple[
     """Return a fresh training with the GPU kernels, and the similarity to its training frame."""
     from nerfcli.captures.loading import load_scene
     from nerfcli.kernels.triton_cuda.backend import TritonBackend
-    from nerfcli.photos.loading import load_photos
     from nerfcli.training.extent import choose_extent
     from nerfcli.training.fitting import Fitting, TrainingInputs
-    from nerfcli.training.pool import PixelPool
+    from nerfcli.training.pool import PixelPool, load_album
     from nerfcli.training.runs.settings import TrainSettings, automatic_downscale
+    from nerfcli.training.storage import IN_MEMORY
 
     captured = load_scene(capture)
     first = captured.train_frames[0].camera
     dry = device.type == "cpu"
     frames = captured.train_frames[:3] if dry else captured.train_frames
-    photos = load_photos(frames, factor=8 if dry else automatic_downscale([first]), threads=4)
+    factor = 8 if dry else automatic_downscale([first])
+    album = load_album(frames, factor=factor, threads=4, storage=IN_MEMORY)
     settings = TrainSettings(
         budget_seconds=None,
         steps=1000,
@@ -191,8 +192,8 @@ def fitting_of(capture: Path, device: Any, batch: int, log2_rows: int) -> tuple[
         samples_per_step=batch,
         log2_rows=log2_rows,
     )
-    extent = choose_extent(captured, settings, is_object=all(photo.pixels.shape[-1] == 4 for photo in photos))
-    pool = PixelPool(photos, extent.training_from_scene, device)
+    extent = choose_extent(captured, settings, is_object=not album.fills_frame)
+    pool = PixelPool(album, extent.training_from_scene, device)
     marching = extent.marching.stretched(20.0) if dry else extent.marching
     fitting = Fitting(TrainingInputs(settings, replace(extent, marching=marching), pool))
     fitting.field.backend = TritonBackend(device)

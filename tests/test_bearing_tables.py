@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torch
 from frame_rays import frame_rays
+from pools import pool_of_photos
 from present import present
 from test_training_rays import BARREL, CPU, FISHEYE, SIMILARITY, numbered_photo, ring
 
 from nerfcli.cameras.camera import Camera, by_lens
-from nerfcli.training.pool import BearingTables, PixelPool
+from nerfcli.training.pool import BearingTables
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.storage import IN_MEMORY, needs_of
 
@@ -27,7 +28,7 @@ def stabilised(lens: Camera) -> list[Camera]:
 def test_rays_of_stabilised_photos_are_those_of_their_cameras(lens):
     """Every pixel of every photo, the borders too; interpolation is off by 1 / (8 f) of a pixel, 1 / f of a radian."""
     photos = [numbered_photo(i, camera, ring()[i % 5]) for i, camera in enumerate(stabilised(lens))]
-    pool = PixelPool(photos, SIMILARITY, CPU)
+    pool = pool_of_photos(photos, SIMILARITY)
     assert pool.without_ray == 0
     count = lens.width * lens.height
     for index, photo in enumerate(photos):
@@ -42,10 +43,10 @@ def test_photos_of_other_lenses_keep_their_bits():
     """A photo of another lens among stabilised ones has the rays that it has alone."""
     cameras = [*stabilised(LENS), FISHEYE, BARREL]
     photos = [numbered_photo(i, camera, ring()[i % 5]) for i, camera in enumerate(cameras)]
-    pool, begin = PixelPool(photos, SIMILARITY, CPU), 7 * LENS.width * LENS.height
+    pool, begin = pool_of_photos(photos, SIMILARITY), 7 * LENS.width * LENS.height
     for photo, camera in ((photos[7], FISHEYE), (photos[8], BARREL)):
         numbers = torch.arange(camera.width * camera.height)
-        alone = PixelPool([photo], SIMILARITY, CPU).rays_of(numbers)
+        alone = pool_of_photos([photo], SIMILARITY).rays_of(numbers)
         among = pool.rays_of(begin + numbers)
         assert torch.equal(among.directions, alone.directions)
         begin += len(numbers)

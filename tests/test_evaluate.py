@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from fog import fog, foggy_cells
+from pools import pool_of_photos
 from present import present
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
@@ -23,9 +24,7 @@ from nerfcli.evaluate.protocol import evaluate_model
 from nerfcli.field.exposure import exposed
 from nerfcli.photos.colours import over_white, to_8_bit
 from nerfcli.photos.images import write_png
-from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.training.checkpoints import HeldoutPixels
-from nerfcli.training.pool import PixelPool
 from nerfcli.training.runs.run import Run
 
 EVERYTHING = np.ones((24, 32), dtype=bool)
@@ -176,7 +175,7 @@ def test_evaluation_of_fog_in_closed_form(gain):
     metrics = evaluate_model(model, [photo])
     assert metrics.images[0].metrics.psnr == pytest.approx(-20 * math.log10(error))
     assert metrics.images[0].metrics.psnr_float == pytest.approx(-20 * math.log10(unrounded), abs=1e-3)
-    pixels = PixelPool([LoadedPhoto(narrow, photo.pixels, None)], Similarity.identity(), torch.device("cpu"))
+    pixels = pool_of_photos([photo])
     measured = HeldoutPixels(pixels).psnr(model, log_gains=np.full((1, 3), gain))
     assert measured == pytest.approx(-20 * math.log10(unrounded), abs=1e-3)
 

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 from PIL import ExifTags, Image
+from pools import pool_of_photos
 from present import present
 from test_images import exif_with, noise
 from trainings import FEW, fit, resumed_bit_for_bit
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.rigid import Similarity, from_parts
+from nerfcli.cameras.rigid import from_parts
 from nerfcli.captures.capture import Capture
 from nerfcli.errors import UserError
 from nerfcli.evaluate.photos import HeldOutPhoto
@@ -31,7 +32,7 @@ from nerfcli.training import schedule
 from nerfcli.training.appearance import Appearance
 from nerfcli.training.checkpoints import Checkpoints, Totals
 from nerfcli.training.fitting import Fitting, TrainingInputs
-from nerfcli.training.pool import PixelBatch, PixelPool
+from nerfcli.training.pool import PixelBatch
 from nerfcli.training.preparation import EarlierDecisions, prepare
 from nerfcli.training.runs.components import Components, Selection
 from nerfcli.training.runs.run import Run, RunConfig
@@ -197,7 +198,7 @@ def parts_of(components: Components, colours: torch.Tensor, gains: list[float]) 
         LoadedPhoto(Frame(f"{i}", Camera("SIMPLE_PINHOLE", 1, 1, (1.0, 0.5, 0.5)), np.eye(4)), level.numpy(), None)
         for i, level in enumerate((colours * 255).round().to(torch.uint8)[:, None, None])
     ]
-    pool = PixelPool(photos, Similarity.identity(), torch.device("cpu"))
+    pool = pool_of_photos(photos)
     log_gains = torch.tensor(gains)[:, None].expand(-1, 3)
     return Appearance(components, pool, log_gains=log_gains), pool.rays_of(torch.arange(len(photos)))
 

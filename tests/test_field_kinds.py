@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from kernel_parts import radiance_of
+from pools import pool_of_photos
 from present import present
 from scipy.ndimage import map_coordinates
 from scipy.special import sph_harm_y
@@ -29,7 +30,6 @@ from nerfcli.training import fitting
 from nerfcli.training.extent import Extent
 from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.optimiser import FieldOptimiser
-from nerfcli.training.pool import PixelPool
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.step import row_decay
@@ -212,7 +212,7 @@ def training_of_two_photos(
 ) -> Fitting:
     photos = load_photos(scene.train_frames[:2], factor=8, threads=1)
     photos = [replace(photo, pixels=photo.pixels[..., : 3 + has_alpha]) for photo in photos]
-    pool = PixelPool(photos, Similarity.identity(), torch.device("cpu"))
+    pool = pool_of_photos(photos)
     settings = TrainSettings(
         budget_seconds=None, steps=9, log2_rows=log2_rows, first_samples_per_step=2**20, samples_per_step=2**20,
         components=components,

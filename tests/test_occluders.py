@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from pools import pool_of_photos
 from test_matched_exposures import exposed
 from test_stereo import LENS, OFFSETS, PINHOLE, TEXTURE, found, photo, truth, written
 
@@ -22,7 +23,6 @@ from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.training import preparation, schedule, selection
 from nerfcli.training.fitting import TrainingInputs
 from nerfcli.training.loop import train
-from nerfcli.training.pool import PixelPool
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.run import Run
 from nerfcli.training.runs.settings import TrainSettings
@@ -191,10 +191,10 @@ def test_a_pool_draws_no_pixel_that_is_left_out(is_masked):
     used = generator.random((150, 200)) < 0.5 if is_masked else None
     photos = [replace(one, used=used) for one in walls()[:2]]
     left_out = [generator.random((150, 200)) < 0.3, np.zeros((150, 200), bool)]
-    pool = PixelPool(photos, SAME, torch.device("cpu")).without(left_out)
+    pool = pool_of_photos(photos).without(left_out)
     wanted = [~mask if used is None else used & ~mask for mask in left_out]
     masked = [replace(one, used=mask) for one, mask in zip(photos, wanted, strict=True)]
-    whole = PixelPool(masked, SAME, torch.device("cpu"))
+    whole = pool_of_photos(masked)
     assert pool.usable is not None
     assert whole.usable is not None
     assert pool.usable.tolist() == whole.usable.tolist()

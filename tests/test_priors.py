@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from pools import pool_of_photos
 from present import present
 from trainings import FEW, fit
 
@@ -78,7 +79,7 @@ def inputs(capture: Capture, tmp_path: Path) -> TrainingInputs:
 
 def pool_of(scene: Capture, masks: str = "ignore", *, similarity: Similarity = SAME) -> PixelPool:
     photos = load_photos(scene.train_frames, factor=1, threads=1, masks=masks)
-    return PixelPool(photos, similarity, torch.device("cpu"))
+    return pool_of_photos(photos, similarity)
 
 
 def tracks_in(scene: Capture) -> Tracks:

@@ -9,6 +9,7 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 from lenses import HEIGHT, MODELS, WIDTH, random_camera
+from pools import pool_of_photos
 from present import present
 from trainings import FEW, fit, resumed_bit_for_bit
 
@@ -72,7 +73,7 @@ def small(spheres: Capture) -> Capture:
 
 def pool_of(scene: Capture) -> PixelPool:
     photos = load_photos(scene.train_frames, factor=1, threads=1)
-    return PixelPool(photos, Similarity.identity(), torch.device("cpu"))
+    return pool_of_photos(photos)
 
 
 @pytest.fixture
@@ -480,7 +481,7 @@ def test_moves_are_reported_in_degrees_and_percent(small):
 def test_frames_are_where_the_cameras_of_the_training_frame_are(small):
     """Exported poses, mapped to the training frame, are those from which rays were cast."""
     similarity = Similarity(2.5, rotation_from_vector(np.array([0.3, -0.2, 0.9])), np.array([1.0, 2.0, 3.0]))
-    pool = PixelPool(load_photos(small.train_frames, factor=1, threads=1), similarity, torch.device("cpu"))
+    pool = pool_of_photos(load_photos(small.train_frames, factor=1, threads=1), similarity)
     refinement = Refinement("poses", pool)
     poses = present(refinement.poses)
     twists = np.random.default_rng(0).normal(size=(3, 6)) * 0.1
@@ -498,7 +499,7 @@ def test_displaced_cameras_return_to_their_places_in_a_trained_field(spheres, sp
     tensors, description = load_tensors(spheres_run / STATE, "cpu")
     extent = Extent.from_json(description["extent"])
     photos = load_photos(noisy.train_frames, factor=1, threads=1)
-    pool = PixelPool(photos, extent.training_from_scene, torch.device("cpu"))
+    pool = pool_of_photos(photos, extent.training_from_scene)
     settings = TrainSettings(
         budget_seconds=None, steps=20, samples_per_step=2**13, threads=2, log2_rows=14,
         components=Components(cameras="poses"), learning_rate=1e-30, final_learning_rate=1e-30,

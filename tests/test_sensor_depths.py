@@ -16,6 +16,7 @@ import tifffile
 import torch
 from every_format import Views, write_polycam, write_record3d
 from PIL import Image
+from pools import pool_of_photos
 from present import present
 from test_stereo import OFFSETS, photo, truth
 
@@ -67,7 +68,7 @@ def place(folder: Path, maps: Sequence[np.ndarray], *, unit: float = 1e-3) -> Pi
         pose = from_parts(np.eye(3), np.array([0.1 * index / METRES, 0.0, 0.0]))
         frame = Frame(image.name, PHOTO, pose, image=image, depth=SensorDepth(depth, unit))
         photos.append(LoadedPhoto(frame, np.full((120, 160, 3), 128, np.uint8), None))
-    return PixelPool(photos, TRAINING, torch.device("cpu"))
+    return pool_of_photos(photos, TRAINING)
 
 
 def levels_of(z: np.ndarray, unit: float = 1e-3) -> np.ndarray:

@@ -10,13 +10,13 @@ from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 pytest.importorskip("triton", reason="Triton is for Linux")
+from pools import pool_of_photos
 
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.captures.capture import Capture
@@ -27,7 +27,7 @@ from nerfcli.render.trained_field import Marching
 from nerfcli.training import pool as pools
 from nerfcli.training.extent import Extent
 from nerfcli.training.fitting import Fitting, TrainingInputs
-from nerfcli.training.pool import PixelPool, PointDepths, PointRays
+from nerfcli.training.pool import PointDepths, PointRays
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
 
@@ -139,7 +139,7 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
 def test_a_step_waits_once_for_the_device(components, most, waits, spheres: Capture):
     photos = load_photos(spheres.train_frames[:3], factor=4, threads=1)
     opaque = [photo.__class__(photo.frame, photo.pixels[..., :3].copy(), photo.used) for photo in photos]
-    pool = PixelPool(opaque, Similarity(1.0, np.eye(3), np.zeros(3)), GPU)
+    pool = pool_of_photos(opaque, device=GPU)
     few = {"budget_seconds": None, "steps": 40, "samples_per_step": 2**9, "log2_rows": 16}
     settings = TrainSettings(components=components, device="cuda", **few)
     depths = [PointDepths(*(torch.zeros(9, device=GPU).to(t) for t in (torch.int64, torch.float32, torch.float32)))]

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
+from pools import pool_of_photos
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -16,7 +16,6 @@ from nerfcli.matching.tracks import Tracks
 from nerfcli.photos.images import write_png
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.training.evidence import dense_points
-from nerfcli.training.pool import PixelPool
 
 PINHOLE = Camera.pinhole(200, 150, 180.0)
 LENS = Camera("RADIAL", 200, 150, (180.0, 103.0, 72.0, -0.12, 0.03))
@@ -148,7 +147,7 @@ def test_threads_change_nothing():
 def test_depths_are_pixels_of_the_pool_in_its_frame():
     similarity = Similarity(0.5, np.eye(3), np.array([1.0, 2.0, 3.0]))
     photos = [photo(x) for x in OFFSETS]
-    pool = PixelPool(photos, similarity, torch.device("cpu"))
+    pool = pool_of_photos(photos, similarity)
     depths = found(photos)
     of_stereo = dense_points(depths, pool)
     rays = pool.rays_of(of_stereo.numbers)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from frame_rays import frame_rays
+from pools import pool_of_photos
 from present import present
 
 from nerfcli.cameras.camera import Camera
@@ -249,10 +250,10 @@ def test_a_downscaled_camera_fits_the_area_averaged_picture(size, factor):
     np.testing.assert_allclose(small[..., 1].ravel(), pixels[:, 1] * 3, atol=1.0)
 
 
-def numbered_photo(index: int, camera: Camera, frame: Frame, channels: int = 3) -> LoadedPhoto:
+def numbered_photo(index: int, camera: Camera, frame: Frame) -> LoadedPhoto:
     """Return a photo whose colours encode each pixel's (photo, row, column)."""
     rows, columns = np.indices((camera.height, camera.width))
-    layers = [np.full_like(rows, index), rows, columns, np.full_like(rows, 255)][:channels]
+    layers = [np.full_like(rows, index), rows, columns]
     return LoadedPhoto(replace(frame, camera=camera), np.stack(layers, axis=-1).astype(np.uint8), None)
 
 
@@ -272,7 +273,7 @@ def drawn(pool: PixelPool, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarr
 def test_drawn_rays_are_those_of_whole_pictures():
     cameras = (CAMERA, FISHEYE, CAMERA, BARREL, FISHEYE)
     photos = [numbered_photo(i, camera, ring()[i]) for i, camera in enumerate(cameras)]
-    origins, directions, numbers = drawn(PixelPool(photos, SIMILARITY, CPU), 5000)
+    origins, directions, numbers = drawn(pool_of_photos(photos, SIMILARITY), 5000)
     assert set(numbers[:, 0]) == {0, 1, 2, 3, 4}
     for index, photo in enumerate(photos):
         rays = frame_rays(photo.frame, SIMILARITY, CPU)
@@ -287,7 +288,7 @@ def test_every_usable_pixel_is_drawn_equally_often():
     # Chi-squared over the pixels of two photos of different size: mean n - 1, standard deviation sqrt(2 n).
     photos = [numbered_photo(0, BARREL, ring()[0]), numbered_photo(1, FISHEYE, ring()[1])]
     usable = int(BARREL.pixel_bearings()[1].sum() + FISHEYE.pixel_bearings()[1].sum())
-    pool = PixelPool(photos, SIMILARITY, CPU)
+    pool = pool_of_photos(photos, SIMILARITY)
     assert pool.without_ray == 24 * 18 + 33 * 21 - usable > 0
     _, _, numbers = drawn(pool, 100 * usable)
     counts = np.unique(numbers, axis=0, return_counts=True)[1]
@@ -299,19 +300,10 @@ def test_masked_pixels_are_never_drawn():
     photo = numbered_photo(0, CAMERA, ring()[0])
     used = np.zeros((30, 40), dtype=bool)
     used[7, 31] = used[29, 0] = True
-    _, _, numbers = drawn(PixelPool([replace(photo, used=used)], SIMILARITY, CPU), 200)
+    _, _, numbers = drawn(pool_of_photos([replace(photo, used=used)], SIMILARITY), 200)
     assert {tuple(row) for row in numbers} == {(0, 7, 31), (0, 29, 0)}
     with pytest.raises(UserError, match="no pixels are left to train on"):
-        PixelPool([replace(photo, used=np.zeros_like(used))], SIMILARITY, CPU)
-
-
-def test_photos_with_and_without_alpha_go_together():
-    photos = [numbered_photo(0, CAMERA, ring()[0]), numbered_photo(1, CAMERA, ring()[1], channels=4)]
-    assert not PixelPool(photos[:1], SIMILARITY, CPU).has_alpha
-    pool = PixelPool(photos, SIMILARITY, CPU)
-    assert pool.has_alpha
-    colours = pool.draw(500, torch.Generator().manual_seed(0)).colours
-    assert (colours[:, 3] == 1).all()
+        pool_of_photos([replace(photo, used=np.zeros_like(used))], SIMILARITY)
 
 
 def test_masks_shrink_to_pixels_that_are_used_whole(tmp_path):
@@ -369,7 +361,7 @@ def test_a_pixel_is_found_again_by_its_number():
         pixels[..., 0] = np.arange(first, first + width * height).reshape(height, width)
         camera = Camera("SIMPLE_PINHOLE", width, height, (5.0, width / 2, height / 2))
         photos.append(LoadedPhoto(Frame(name, camera, np.eye(4)), pixels, None))
-    pool = PixelPool(photos, SIMILARITY, CPU)
+    pool = pool_of_photos(photos, SIMILARITY)
     by_name = {photo.frame.name: photo.pixels for photo in photos}
     for number in range(len(pool.colours)):
         name, x, y = pool.place(number)
@@ -378,7 +370,7 @@ def test_a_pixel_is_found_again_by_its_number():
 
 def drawn_from(frames: list[Frame], room: PhotoStorage) -> tuple[list[bytes], Album, PixelPool]:
     album = load_album(frames, factor=2, threads=2, storage=room)
-    pool = PixelPool(album.photos, SIMILARITY, CPU, colours=album.colours, storage=room)
+    pool = PixelPool(album, SIMILARITY, CPU, storage=room)
     drawn = pool.draw(3000, torch.Generator().manual_seed(4))
     return [tensor.numpy().tobytes() for tensor in drawn], album, pool
 
@@ -398,7 +390,7 @@ def test_photos_in_files_give_the_same_rays_as_in_memory(alpha, masked, tmp_path
     in_memory, album, pool = drawn_from(frames, IN_MEMORY)
     in_files, _, _ = drawn_from(frames, InFiles(tmp_path / "room", 1))  # a limit that is always exceeded
     assert in_files == in_memory
-    one_by_one = PixelPool(load_photos(frames, factor=2, threads=1), SIMILARITY, CPU)
+    one_by_one = pool_of_photos(load_photos(frames, factor=2, threads=1), SIMILARITY)
     drawn = one_by_one.draw(3000, torch.Generator().manual_seed(4))
     assert [tensor.numpy().tobytes() for tensor in drawn] == in_memory
     assert album.fills_frame == (not all(alpha))

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from pools import pool_of_photos
 from present import present
 
 from nerfcli.captures.capture import Capture
@@ -15,7 +16,6 @@ from nerfcli.field.exposure import exposed
 from nerfcli.photos.loading import load_photos
 from nerfcli.training.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
 from nerfcli.training.fitting import Fitting, TrainingInputs
-from nerfcli.training.pool import PixelPool
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import Budget
@@ -33,7 +33,7 @@ def trials(spheres) -> Trials:
 def inputs_of(scene: Capture) -> TrainingInputs:
     extent = choose_extent(scene, SETTINGS, is_object=True)
     photos = load_photos(scene.train_frames, factor=4, threads=1)
-    return TrainingInputs(SETTINGS, extent, PixelPool(photos, extent.training_from_scene, torch.device("cpu")))
+    return TrainingInputs(SETTINGS, extent, pool_of_photos(photos, extent.training_from_scene))
 
 
 def fitting_of(trials: Trials, components: Components) -> Fitting:

@@ -6,7 +6,7 @@ opened before, so training can neither learn from them nor be stopped or steered
 
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -202,14 +202,9 @@ def measure_waypoints(
             album = load_album(
                 held_out, factor=inputs.factor, threads=settings.threads, storage=inputs.storage, masks=masks
             )
-            pool = PixelPool(
-                [photo.without(inputs.attached.get(photo.frame.name)) for photo in album.photos],
-                inputs.extent.training_from_scene,
-                torch.device(device),
-                colours=album.colours,
-                storage=inputs.storage,
-            )
-            pixels = HeldoutPixels(pool)
+            seen = tuple(photo.without(inputs.attached.get(photo.frame.name)) for photo in album.photos)
+            album, similarity = replace(album, photos=seen), inputs.extent.training_from_scene
+            pixels = HeldoutPixels(PixelPool(album, similarity, torch.device(device), storage=inputs.storage))
         except UserError as error:
             notify(f"training is complete, but PSNR on held-out photos could not be measured: {error}")
             forget_waypoints(run)

@@ -144,7 +144,8 @@ def load_album(
                 return None
             has_alpha = photo.pixels.shape[-1] == kept == 4
             part = colours[begins[index] : begins[index + 1]].reshape(*photo.pixels.shape[:2], -1)
-            part[...] = photo.pixels[..., :kept] if has_alpha or kept == 3 else _with_alpha(photo.pixels)
+            part[..., 3:] = 255  # of a photo without alpha beside one that has it
+            part[..., : photo.pixels.shape[-1]] = photo.pixels[..., :kept]
             storage.release_pages()
             return replace(photo, pixels=part), not has_alpha
 
@@ -198,27 +199,24 @@ def pixel_footprint(frames: Sequence[Frame], training_from_scene: Similarity) ->
 
 
 class PixelPool:
-    """All usable pixels of a set of photos, and their rays in the training frame.
+    """All usable pixels of an album, and their rays in the training frame.
 
     Photos of one lens share its bearings, see `BearingTables`. `frames` are those of the photos, in the scene's frame;
     `without_ray` is the number of pixels without a direction in the lens model, which are left out; `footprint` is from
     `pixel_footprint`; `cones` (P,) are the widths of a pixel of each photo at distance 1; `sizes` (P, 2) are the
     heights and widths of the photos.
-
-    Args:
-        colours: of all photos in one array, if there is such an array already.
     """
 
     def __init__(
         self,
-        photos: Sequence[LoadedPhoto],
+        album: Album,
         training_from_scene: Similarity,
         device: torch.device,
         *,
-        colours: np.ndarray | None = None,
         storage: PhotoStorage = IN_MEMORY,
     ):
-        self.colours = torch.from_numpy(_one_after_another(photos) if colours is None else colours).to(device)
+        photos = album.photos
+        self.colours = torch.from_numpy(album.colours).to(device)
         self._backend = backend_for(device, torch.float32)
         self.training_from_scene = training_from_scene
         counts = [photo.pixels.shape[0] * photo.pixels.shape[1] for photo in photos]
@@ -367,16 +365,3 @@ class PointRays:
         chosen = reduce(PointDepths.joined, [depths.draw(count, generator) for depths in self.sets])
         both = self._pool.rays_of(torch.cat([drawn.numbers, chosen.numbers]))
         return both._replace(distances=chosen.distances, trust=chosen.trust)
-
-
-def _one_after_another(photos: Sequence[LoadedPhoto]) -> np.ndarray:
-    any_alpha = any(photo.pixels.shape[-1] == 4 for photo in photos)
-    pixels = [_with_alpha(photo.pixels) if any_alpha else photo.pixels for photo in photos]
-    return np.concatenate([part.reshape(-1, part.shape[-1]) for part in pixels])
-
-
-def _with_alpha(pixels: np.ndarray) -> np.ndarray:
-    """Return the pixels as RGBA, opaque if the photo has no alpha."""
-    if pixels.shape[-1] == 4:
-        return pixels
-    return np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=-1)

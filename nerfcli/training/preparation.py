@@ -92,7 +92,7 @@ def prepare(
     if begun is not None:
         settings = replace(settings, components=begun.config.components)
     extent = distributed.from_first(lambda: _extent(photos, settings, notify=notify) if begun is None else begun.extent)
-    pool = PixelPool(photos.album.photos, extent.training_from_scene, device, colours=album.colours, storage=storage)
+    pool = PixelPool(photos.album, extent.training_from_scene, device, storage=storage)
     camera = pool.cameras[0]
     notify(
         f"{len(pool.frames)} training photos, {len(scene.test_frames)} held out, {camera.width}x{camera.height} "
