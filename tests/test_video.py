@@ -38,7 +38,7 @@ def decoded(path: Path, *, height: int, width: int) -> np.ndarray:
     return np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
 
 
-def write(path: Path, frames: list[np.ndarray], *, fps: float = 30, comment: str = "") -> None:
+def write(path: Path, frames: list[np.ndarray], *, fps: float = 30, comment: str = "what it shows") -> None:
     write_video(path, lambda: frames, fps=fps, comment=comment)
 
 
@@ -60,7 +60,7 @@ def test_video_has_every_frame_in_its_colours(tmp_path, name, parts):
         yield from frames
         assert not path.exists()
 
-    write_video(path, source, fps=12.5)
+    write_video(path, source, fps=12.5, comment="what it shows")
     assert [p.name for p in path.parent.iterdir()] == [name]
     found = decoded(path, height=48, width=64)
     assert len(found) == 7
@@ -146,7 +146,7 @@ def test_nothing_is_left_after_an_exception(tmp_path, num_frames, problem, kind,
         raise problem
 
     with pytest.raises(type(problem)) as caught:
-        write_video(tmp_path / f"a.{kind}", interrupted, fps=30)
+        write_video(tmp_path / f"a.{kind}", interrupted, fps=30, comment="what it shows")
     assert caught.value is problem
     assert list(tmp_path.iterdir()) == []
     assert len(encoders) == (num_frames > 0)

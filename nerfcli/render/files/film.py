@@ -1,6 +1,5 @@
 """Videos of frames, streamed to ffmpeg: H.264 in mp4, or gif; written whole or not at all."""
 
-import os
 import re
 import shutil
 import subprocess
@@ -50,7 +49,7 @@ def check_encoders(formats: Iterable[str]) -> None:
             )
 
 
-def write_video(path: Path, frames: Callable[[], Iterable[np.ndarray]], *, fps: float, comment: str = "") -> None:
+def write_video(path: Path, frames: Callable[[], Iterable[np.ndarray]], *, fps: float, comment: str) -> None:
     """Encode frames one by one, with memory independent of their number. The file appears when it is complete.
 
     The last column or row of frames with odd width or height is doubled, because H.264 stores colour for pairs of
@@ -62,6 +61,7 @@ def write_video(path: Path, frames: Callable[[], Iterable[np.ndarray]], *, fps: 
         frames: returns the frames from the first to the last, uint8 (height, width, 3) sRGB, all of one size; called
             for each pass over them (a gif takes one for its palette and one for its pixels).
         fps: frames per second, > 0.
+        comment: a text for the file's metadata, not empty.
 
     Raises:
         UserError: the file cannot be written, there is no ffmpeg, or it fails.
@@ -92,9 +92,6 @@ def _write_gif(
 def _add_gif_comment(plain: Path, commented: Path, comment: str) -> None:
     """Copy a gif with a comment extension before the first picture (GIF89a, section 24); ffmpeg writes none."""
     text = comment.encode()
-    if not text:  # an empty extension makes ffmpeg stumble
-        os.replace(plain, commented)
-        return
     blocks = b"".join(bytes([len(part)]) + part for part in (text[i : i + 255] for i in range(0, len(text), 255)))
     with plain.open("rb") as source, commented.open("wb") as target:
         header = source.read(13)
