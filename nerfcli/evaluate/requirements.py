@@ -30,10 +30,6 @@ class Requirement:
     def __str__(self) -> str:
         return f"{self.name}{self.comparison}{self.bound:g}"
 
-    def is_met(self, value: float | None) -> bool:
-        """Return whether a number meets the requirement; an unknown one does not."""
-        return value is not None and bool(_COMPARISONS[self.comparison](value, self.bound))
-
 
 def parse_requirements(text: str) -> tuple[Requirement, ...]:
     """Parse requirements separated by commas.
@@ -68,7 +64,7 @@ def unmet(requirements: Sequence[Requirement], numbers: Mapping[str, float | Non
     failures = []
     for requirement in requirements:
         value = numbers.get(requirement.name)
-        if not requirement.is_met(value):
+        if value is None or not _COMPARISONS[requirement.comparison](value, requirement.bound):
             found = "not known" if value is None else f"{value:.4g}"
             failures.append(f"{requirement} ({requirement.name} is {found})")
     return failures

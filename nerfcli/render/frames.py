@@ -222,7 +222,7 @@ def _render_frame(
             picture = with_measured_errors(picture, job.depth_errors)
         picture, removed = without_unseen_depth(picture, settings.depth)
     facts = truncation_bounds(picture, TOLERANCE)
-    if job.measures(index):
+    if settings.check_accuracy or index in (0, len(job.frames) - 1):
         facts |= model.measured_error(frame, depth=wanted)
     bounds = {**facts, "meaning": ERROR_IN_WORDS}
     meta = frame_meta(depth_meta(model, settings.depth), frame, provenance=job.provenance, error_bounds=bounds)

@@ -239,10 +239,6 @@ class RenderJob:
                 "remove the video options, or choose cameras of a single size",
             )
 
-    def measures(self, index: int) -> bool:
-        """Return whether the error of a frame's rendering is measured."""
-        return self.settings.check_accuracy or index in (0, len(self.frames) - 1)
-
     def is_kept_in(self, folder: Path, output: Output) -> bool:
         """Return whether the finished folder holds this job, pictures and presentation, and stays.
 

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import focus_point
 from nerfcli.cameras.rigid import Similarity, apply, inverse
 from nerfcli.captures.capture import Capture
@@ -120,8 +119,10 @@ def fits_object_frame(scene: Capture) -> bool:
 def _object_ball(scene: Capture) -> tuple[np.ndarray, float]:
     """Return the centre and the radius of the smallest ball that fills every camera's view."""
     centre = _focus(scene, _typical_depths(scene))
-    views = zip(_distances(scene, centre), scene.frames, strict=True)
-    return centre, max(distance * math.tan(_half_fov(frame)) for distance, frame in views)
+    # Half of the wider field of view: objects are not seen farther off-axis than by 70 degrees.
+    halves_deg = [min(max(frame.camera.fov_deg) / 2, 70.0) for frame in scene.frames]
+    views = zip(_distances(scene, centre), halves_deg, strict=True)
+    return centre, max(distance * math.tan(math.radians(half)) for distance, half in views)
 
 
 def box_frame(scene: Capture) -> tuple[Similarity, Marching]:
@@ -164,11 +165,6 @@ def _focus(scene: Capture, depths: np.ndarray | None) -> np.ndarray:
 def _distances(scene: Capture, centre: np.ndarray) -> np.ndarray:
     """Return the distances of the cameras from a point."""
     return np.array([np.linalg.norm(frame.centre - centre) for frame in scene.frames])
-
-
-def _half_fov(frame: Frame) -> float:
-    """Return half of the wider field of view, in radians, at most 70 degrees: objects are not seen farther off-axis."""
-    return math.radians(min(max(frame.camera.fov_deg) / 2, 70.0))
 
 
 def _typical_depths(scene: Capture) -> np.ndarray | None:
