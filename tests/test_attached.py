@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from test_stereo import TEXTURE, truth, written
+from trainings import FEW, fit
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -21,7 +22,6 @@ from nerfcli.poses.engine import turntable
 from nerfcli.poses.engine.turntable import mask_turning_object, recall_masks
 from nerfcli.poses.input.job import CameraGroup, Job
 from nerfcli.training import preparation
-from nerfcli.training.loop import train
 from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.run import Run
 from nerfcli.training.runs.settings import TrainSettings
@@ -148,12 +148,7 @@ def capture(tmp_path: Path) -> Capture:
 
 @pytest.mark.parametrize("fixed", [(), ("occluders",)], ids=["by default", "without occluders"])
 def test_training_and_evaluation_leave_it_out(capture, tmp_path, fixed):
-    chosen = TrainSettings(
-        budget_seconds=None, steps=20, first_samples_per_step=2**9, samples_per_step=2**9, log2_rows=10, model="auto",
-        fixed=fixed,
-    )  # fmt: skip
-    notes: list[str] = []
-    train(capture, tmp_path / "run", chosen, resume=False, notify=notes.append, on_progress=lambda progress: None)
+    fit(capture, tmp_path / "run", replace(FEW, steps=20, model="auto", fixed=fixed), notes=(notes := []))
     written = {path.name for path in (tmp_path / "run" / "occluders").rglob("*.png")}
     messages = [note for note in notes if note.startswith("attached to the camera: ") and "of 9 photos" in note]
     run = Run(tmp_path / "run")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import SPHERES
 from present import present
+from trainings import held_out_photos
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -198,8 +199,7 @@ def spheres_billboards() -> Billboards:
 
 @pytest.fixture
 def held_out() -> list[HeldOutPhoto]:
-    photos = load_photos(load_scene(SPHERES).test_frames, factor=1, threads=1)
-    return [HeldOutPhoto(photo.frame, photo.pixels, photo.used) for photo in photos]
+    return held_out_photos(load_scene(SPHERES))
 
 
 def test_the_spheres_have_a_shape(spheres_model, spheres_billboards, held_out):

@@ -10,6 +10,7 @@ import torch
 from pools import pool_of_photos
 from test_matched_exposures import exposed
 from test_stereo import LENS, OFFSETS, PINHOLE, TEXTURE, found, photo, truth, written
+from trainings import FEW, fit
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.rigid import Similarity
@@ -22,10 +23,8 @@ from nerfcli.photos.images import read_image
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.training import preparation, schedule, selection
 from nerfcli.training.fitting import TrainingInputs
-from nerfcli.training.loop import train
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.run import Run
-from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.trials import Trials
 
 SAME = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
@@ -221,12 +220,8 @@ def test_a_training_leaves_out_what_it_finds_and_writes_masks(capture, tmp_path,
     monkeypatch.setattr(schedule, "FEWEST_STEPS", 1)
     seen: list[TrainingInputs] = []
     monkeypatch.setattr(preparation, "Trials", lambda inputs: seen.append(inputs) or Trials(inputs))
-    chosen = TrainSettings(
-        budget_seconds=None, steps=40, first_samples_per_step=2**9, samples_per_step=2**9, log2_rows=10, model=model,
-        components=Components(occluders=model == "default"),
-    )  # fmt: skip
-    notes: list[str] = []
-    train(capture, tmp_path / "run", chosen, resume=False, notify=notes.append, on_progress=lambda progress: None)
+    settings = replace(FEW, steps=40, model=model, components=Components(occluders=model == "default"))
+    fit(capture, tmp_path / "run", settings, notes=(notes := []))
     written = {path.name: read_image(path) for path in (tmp_path / "run" / "occluders").rglob("*.png")}
     assert list(written) == ["1.png.png"]
     disc = cv2.resize(DISC.astype(np.uint8), (400, 300), interpolation=cv2.INTER_NEAREST) > 0

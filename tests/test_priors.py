@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from pools import pool_of_photos
 from present import present
-from trainings import FEW, fit
+from trainings import FEW, fit, prepared
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -32,7 +32,6 @@ from nerfcli.training.evidence import point_depths, tracks_of_model
 from nerfcli.training.fitting import Fitting, TrainingInputs
 from nerfcli.training.losses import emerging_losses
 from nerfcli.training.pool import PixelPool, PointRays
-from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import point_weight
@@ -41,6 +40,7 @@ from nerfcli.training.step import NonFiniteError
 
 CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
 SAME = Similarity.identity()
+TEN_STEPS = TrainSettings(budget_seconds=None, steps=10)
 # Both cameras see them; the first point is off by half a pixel in the second camera.
 POINTS = np.array([[0.0, 0.0, 1.0], [0.3, 0.1, 2.0], [-0.2, -0.1, 4.0]])
 
@@ -73,8 +73,7 @@ def capture(tmp_path: Path) -> Capture:
 
 @pytest.fixture
 def inputs(capture: Capture, tmp_path: Path) -> TrainingInputs:
-    settings = TrainSettings(budget_seconds=None, steps=10, components=Components(points=0.1))
-    return prepare(capture, settings, run=tmp_path, notify=lambda text: None)
+    return prepared(capture, tmp_path, replace(TEN_STEPS, components=Components(points=0.1)))[0]
 
 
 def pool_of(scene: Capture, masks: str = "ignore", *, similarity: Similarity = SAME) -> PixelPool:
@@ -128,9 +127,8 @@ def test_a_model_without_sightings_gives_no_tracks(spheres):
 
 def test_missing_points_that_were_requested_are_an_error(spheres, tmp_path):
     alone = replace(spheres, frames=spheres.train_frames[:1], test_names=frozenset())
-    settings = TrainSettings(budget_seconds=None, steps=1, downscale=8, components=Components(points=0.1))
     with pytest.raises(UserError, match="no 3D point could be triangulated"):
-        prepare(alone, settings, run=tmp_path, notify=lambda text: None)
+        prepared(alone, tmp_path, replace(TEN_STEPS, downscale=8, components=Components(points=0.1)))
 
 
 def test_light_off_its_target_counts_by_how_far_it_is():
@@ -209,17 +207,12 @@ def test_cameras_with_an_impossible_lens_are_named_and_not_called_exact(spheres,
     monkeypatch.setattr("nerfcli.training.selection.FEWEST_STEPS", 1)
     monkeypatch.setattr("nerfcli.training.schedule.FEWEST_STEPS", 1)
 
-    def notes(spheres: Capture) -> str:
-        reported: list[str] = []
-        settings = TrainSettings(budget_seconds=None, steps=40, downscale=8, model="auto", log2_rows=10)
-        prepare(spheres, settings, run=tmp_path, notify=reported.append)
-        return "\n".join(reported)
-
     width, height = (focal := spheres.frames[0].camera).size
     bent = Camera("RADIAL", width, height, (focal.focal_px, width / 2, height / 2, -20.0, 0.0))
     broken = replace(spheres, frames=tuple(replace(frame, camera=bent) for frame in spheres.frames))
-    assert "these cameras are exact" in notes(spheres)
-    said = notes(broken)
+    settings = replace(TEN_STEPS, steps=40, downscale=8, model="auto", log2_rows=10)
+    of_spheres, said = ("\n".join(prepared(scene, tmp_path, settings)[1]) for scene in (spheres, broken))
+    assert "these cameras are exact" in of_spheres
     assert "these cameras are exact" not in said
     assert re.search(r"[6-9]\d % of all: the distortion of the lens must be wrong", said)
 
@@ -228,9 +221,7 @@ def test_trials_that_become_non_finite_end_without_an_error(capture, tmp_path, m
     """Components that photos support are still selected."""
     monkeypatch.setattr("nerfcli.training.schedule.FEWEST_STEPS", 1)
     monkeypatch.setattr(Fitting, "advance", Mock(side_effect=NonFiniteError))
-    reported: list[str] = []
-    settings = TrainSettings(budget_seconds=None, steps=40, model="auto", log2_rows=10)
-    inputs = prepare(capture, settings, run=tmp_path, notify=reported.append)
+    inputs, reported = prepared(capture, tmp_path, replace(TEN_STEPS, steps=40, model="auto", log2_rows=10))
     assert "numbers became non-finite in a trial; only components that need no trial are selected" in reported
     assert inputs.settings.components.points > 0.0
 
@@ -291,9 +282,7 @@ def test_training_takes_all_of_them_at_once(capture, tmp_path):
 
 
 def test_a_short_training_takes_known_points_without_a_trial(capture, tmp_path):
-    settings = TrainSettings(budget_seconds=None, steps=10, model="auto")
-    reported: list[str] = []
-    inputs = prepare(capture, settings, run=tmp_path, notify=reported.append)
+    inputs, reported = prepared(capture, tmp_path, replace(TEN_STEPS, model="auto"))
     assert inputs.settings.components == Components(points=0.1)
     assert [len(depths.numbers) for depths in present(inputs.points).sets] == [3]
     assert "points: kept, 3 pixels see a 3D point at a known distance" in reported
@@ -304,8 +293,7 @@ def test_a_short_training_does_not_wait_for_photos_to_be_compared(capture, tmp_p
     compared = "nerfcli.matching.correspondences.match"
     monkeypatch.setattr(compared, lambda *photos, **threads: pytest.fail("photos were compared"))
     without_model = replace(capture, root=tmp_path / "elsewhere")
-    settings = TrainSettings(**limit, model="auto")
-    inputs = prepare(without_model, settings, run=tmp_path, notify=lambda text: None)
+    inputs, _ = prepared(without_model, tmp_path, TrainSettings(**limit, model="auto"))
     assert inputs.settings.components == Components()
 
 
@@ -315,9 +303,7 @@ def test_lenses_that_are_to_learn_begin_where_matched_features_say(cameras, capt
     check = CameraCheck(-0.019, 0.0006, (0.26, 0.14), 900)
     facts = Facts("hash", has_alpha=False, has_exif=False, cameras=check, fixed=("cameras",))
     monkeypatch.setattr("nerfcli.training.preparation._facts", lambda *args: facts)
-    settings = TrainSettings(budget_seconds=None, steps=10, components=Components(cameras=cameras), model="default")
-    reported: list[str] = []
-    inputs = prepare(capture, settings, run=tmp_path, notify=reported.append)
+    inputs, reported = prepared(capture, tmp_path, replace(TEN_STEPS, components=Components(cameras=cameras)))
     learns = cameras in ("focal", "all")
     assert inputs.log_focal == (check.log_focal if learns else 0.0)
     assert any("suggest a focal length 1.88 %" in line for line in reported) == learns

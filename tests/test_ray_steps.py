@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from trainings import prepared
 
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.field.hash_field import HashFieldSettings
@@ -11,7 +12,6 @@ from nerfcli.field.voxel_field import VoxelFieldSettings
 from nerfcli.render.trained_field import Marching
 from nerfcli.training.extent import Extent, RaySteps, halvings
 from nerfcli.training.fitting import Fitting
-from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.schedule import DETAILED_STEPS, stride
 
@@ -77,8 +77,7 @@ def test_pictures_of_detailed_fields_have_at_most_half_of_the_steps_of_the_captu
 
 def test_a_training_sees_the_parallax_of_its_capture(spheres, tmp_path):
     # Steps of 2 sqrt(3) / 512 in a cube of side 2 are 3.46 cells long where 1024 fit along its side.
-    settings = TrainSettings(budget_seconds=None, steps=10, log2_rows=17, model="default")
-    inputs = prepare(spheres, settings, run=tmp_path, notify=lambda text: None)
+    inputs, _ = prepared(spheres, tmp_path, TrainSettings(budget_seconds=None, steps=10, log2_rows=17))
     assert inputs.extent.parallax == 1.0
     most = []
     for parallax in (1.0, 0.5):

@@ -19,6 +19,7 @@ from PIL import Image
 from pools import pool_of_photos
 from present import present
 from test_stereo import OFFSETS, photo, truth
+from trainings import prepared
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame, SensorDepth
@@ -39,7 +40,6 @@ from nerfcli.photos.sensor_depth import read_sensor_depth
 from nerfcli.training import sensor_depths as module
 from nerfcli.training.evidence import dense_points
 from nerfcli.training.pool import PixelPool, PointDepths
-from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.components import Components
 from nerfcli.training.runs.settings import TrainSettings
 from nerfcli.training.sensor_depths import Registration, fitted, seen_points, sensor_depths
@@ -221,10 +221,10 @@ def walls(folder: Path) -> Capture:
 
 @pytest.mark.parametrize("fixed", [(), ("sensor",)])
 def test_training_selects_the_depths_of_its_photos_and_reads_no_other(tmp_path, monkeypatch, fixed):
-    opened, said, read = list[str](), list[str](), module.read_sensor_depth
+    opened, read = list[str](), module.read_sensor_depth
     monkeypatch.setattr(module, "read_sensor_depth", lambda *given: opened.append(given[1].name) or read(*given))
     settings = TrainSettings(budget_seconds=None, steps=50, model="auto", fixed=fixed)
-    inputs = prepare(walls(tmp_path), settings, run=tmp_path, notify=said.append)
+    inputs, said = prepared(walls(tmp_path), tmp_path, settings)
     assert inputs.settings.components.sensor == (not fixed)
     assert set(opened) == (set() if fixed else {"0.png", "2.png", "3.png", "5.png"})
     if not fixed:
@@ -242,7 +242,7 @@ def test_a_model_with_sensor_needs_maps(tmp_path):
     capture = replace(capture, frames=tuple(replace(frame, depth=None) for frame in capture.frames))
     settings = TrainSettings(budget_seconds=None, steps=50, components=Components(sensor=True))
     with pytest.raises(UserError, match="no depth maps of a sensor that its photos confirm"):
-        prepare(capture, settings, run=tmp_path, notify=lambda text: None)
+        prepared(capture, tmp_path, settings)
 
 
 def test_known_distances_of_a_sensor_count_as_much_as_points():

@@ -17,7 +17,7 @@ import pytest
 import torch
 from conftest import SPHERES
 from present import present
-from trainings import FEW, fit, resumed_bit_for_bit, weights
+from trainings import FEW, fit, held_out_photos, resumed_bit_for_bit, weights
 
 from nerfcli import kernels
 from nerfcli.cameras.camera import Camera
@@ -30,7 +30,6 @@ from nerfcli.captures.formats.run_cameras import read_cameras, write_cameras
 from nerfcli.captures.holdout import default_split
 from nerfcli.captures.loading import fingerprint
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.evaluate.protocol import evaluate_model
 from nerfcli.field import hash_field
 from nerfcli.field.checkpoint import load_tensors, save_tensors
@@ -67,11 +66,6 @@ def straight(views: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[
     """A training with `ADAPTIVE` that nothing interrupts, and the progress of its steps. Do not write into its run."""
     run = tmp_path_factory.mktemp("straight") / "run"
     return run, fit(views, run, ADAPTIVE)
-
-
-def held_out_photos(scene: Capture) -> list[HeldOutPhoto]:
-    photos = load_photos(scene.test_frames, factor=1, threads=1)
-    return [HeldOutPhoto(photo.frame, photo.pixels, photo.used) for photo in photos]
 
 
 def test_held_out_views_are_far_better_than_one_colour(spheres, spheres_run):

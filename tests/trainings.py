@@ -8,8 +8,12 @@ from torch import Tensor
 
 from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.run_cameras import read_cameras
+from nerfcli.evaluate.photos import HeldOutPhoto
 from nerfcli.field.checkpoint import load_tensors
+from nerfcli.photos.loading import load_photos
+from nerfcli.training.fitting import TrainingInputs
 from nerfcli.training.loop import Progress, train
+from nerfcli.training.preparation import prepare
 from nerfcli.training.runs.files import FIELD, STATE
 from nerfcli.training.runs.settings import TrainSettings
 
@@ -63,6 +67,18 @@ def resumed_bit_for_bit(scene: Capture, folder: Path, settings: TrainSettings, *
     ]
     assert cameras[0] == cameras[1]
     return load_tensors(folder / "parts" / STATE, "cpu")[0]
+
+
+def prepared(scene: Capture, folder: Path, settings: TrainSettings) -> tuple[TrainingInputs, list[str]]:
+    """Return what a training begins from, and the messages for the user."""
+    notes: list[str] = []
+    return prepare(scene, settings, run=folder, notify=notes.append), notes
+
+
+def held_out_photos(scene: Capture) -> list[HeldOutPhoto]:
+    """Return the held-out photos of a scene as they are, without gains."""
+    photos = load_photos(scene.test_frames, factor=1, threads=1)
+    return [HeldOutPhoto(photo.frame, photo.pixels, photo.used) for photo in photos]
 
 
 def weights(run: Path, file: str = FIELD) -> dict[str, bytes]:
