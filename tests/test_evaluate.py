@@ -9,7 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from examples import examples
 from fog import fog, foggy_cells
+from hypothesis import given
+from hypothesis import strategies as st
 from pools import pool_of_photos
 from present import present
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
@@ -18,9 +21,9 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.evaluate.metrics import psnr, ssim, whole_windows
+from nerfcli.evaluate.metrics import Metrics, psnr, ssim, whole_windows
 from nerfcli.evaluate.photos import HeldOutPhoto, held_out_photos
-from nerfcli.evaluate.protocol import evaluate_model
+from nerfcli.evaluate.protocol import PhotoMetrics, evaluate_model, outlier_warnings, outliers
 from nerfcli.field.exposure import exposed
 from nerfcli.photos.colours import over_white, to_8_bit
 from nerfcli.photos.images import write_png
@@ -223,3 +226,61 @@ def test_nothing_held_out_is_reported():
     with pytest.raises(UserError, match="no held-out photos to evaluate on") as caught:
         evaluate_model(fog(NOWHERE, Similarity.identity()), [])
     assert caught.value.exit_code == BAD_INPUT
+
+
+# Photos far below the others: named where they stand out, silent at ordinary spread
+
+
+def images(*psnrs: float) -> list[PhotoMetrics]:
+    return [PhotoMetrics(f"{index}.jpg", Metrics(psnr)) for index, psnr in enumerate(psnrs)]
+
+
+def names(*psnrs: float) -> list[str]:
+    return [image.name for image in outliers(images(*psnrs))]
+
+
+def test_a_photo_far_below_the_others_is_named():
+    """The numbers of a capture whose group of photos stood on the wrong side of the object."""
+    psnrs = (24.1, 25.0, 26.9, 25.7, 23.5, 26.1, 25.9, 25.2, 26.4, 24.8, 11.3, 25.7, 26.0)
+    assert names(*psnrs) == ["10.jpg"]
+    (text,) = outlier_warnings(images(*psnrs))
+    assert "10.jpg (11.3 dB)" in text
+    assert "25.7 dB" in text
+    assert "nerfcli doctor SCENE" in text
+
+
+@pytest.mark.parametrize(
+    "psnrs",
+    [
+        (25.0, 25.1, 24.9, 25.0, 25.05, 20.0),  # equal but for one, yet it lacks only 5 dB
+        (30.0, 26.0, 22.0, 18.0, 14.0, 10.0, 6.0),  # as spread as views of a large scene
+        (25.0, 25.2, 24.8, 25.1, 12.0, 11.0),  # a third of them is no exception
+        (25.0, 25.0, 25.0, 10.0),  # too few to know what is usual
+        (25.0, 25.0, 25.0, 25.0, 100.0),  # only low ones count
+    ],
+)
+def test_ordinary_spread_gives_no_warning(psnrs):
+    assert outlier_warnings(images(*psnrs)) == []
+
+
+@examples(40)
+@given(st.integers(0, 2**32 - 1), st.integers(5, 60), st.floats(0.1, 3.0))
+def test_photos_of_normal_spread_are_named_only_beyond_five_deviations(seed, count, deviation):
+    values = np.random.default_rng(seed).uniform(25 - 2 * deviation, 25 + 2 * deviation, count)
+    # At most 4 deviations of the uniform range from the median, of which the floor of 6 dB hides half.
+    low = outliers(images(*values))
+    median = float(np.median(values))
+    spread = float(np.median(np.abs(values - median)))
+    assert all(image.metrics.psnr < median - max(6.0, 7.413 * spread) for image in low)
+
+
+def test_evaluation_warns_of_a_photo_that_shows_something_else():
+    model = fog(NOWHERE, Similarity.identity(), background=(0.2, 0.2, 0.2))
+    held_out = [
+        HeldOutPhoto(frame(f"{index}.png"), np.full((12, 16, 3), level, np.uint8), None)
+        for index, level in enumerate((70, 72, 74, 76, 78, 250))
+    ]
+    metrics = evaluate_model(model, held_out)
+    assert len(metrics.warnings) == 1
+    assert "5.png" in metrics.warnings[0]
+    assert evaluate_model(model, held_out[:5]).warnings == ()

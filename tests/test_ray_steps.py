@@ -86,20 +86,14 @@ def test_a_training_sees_the_parallax_of_its_capture(spheres, tmp_path):
     assert most[0] == pytest.approx(2 * most[1], abs=2)
 
 
-def test_equal_steps_cover_near_to_far():
-    edges = Marching(1.0, 2.0, shortest_step=0.1, growth=0.0).edges()
-    assert edges[0] == 1.0
-    assert edges[-2] >= 2.0
-    torch.testing.assert_close(edges.diff(), torch.full_like(edges[1:], 0.1), rtol=1e-9, atol=0)
-
-
-def test_steps_grow_with_distance():
-    edges = Marching(0.1, 300.0, shortest_step=0.01, growth=0.05).edges()
-    steps = edges.diff()
-    # A constant fraction of the distance up to 1, equal steps in 1 / distance beyond.
-    expected = (edges[:-1] * edges[:-1].clamp_min(1.0) * 0.05).clamp_min(0.01)
-    torch.testing.assert_close(steps, expected, rtol=1e-9, atol=0)
-    assert edges[-2] >= 300.0
+@pytest.mark.parametrize(("near", "far", "step", "growth"), [(1.0, 2.0, 0.1, 0.0), (0.1, 300.0, 0.01, 0.05)])
+def test_steps_grow_with_distance_and_cover_near_to_far(near, far, step, growth):
+    """A constant fraction of the distance up to 1, equal steps in 1 / distance beyond; without growth, all alike."""
+    edges = Marching(near, far, shortest_step=step, growth=growth).edges()
+    expected = (edges[:-1] * edges[:-1].clamp_min(1.0) * growth).clamp_min(step)
+    torch.testing.assert_close(edges.diff(), expected, rtol=1e-9, atol=0)
+    assert edges[0] == near
+    assert edges[-2] >= far
 
 
 @pytest.mark.parametrize(("near", "far", "step"), [(1.0, 1.0, 0.1), (-1.0, 1.0, 0.1), (0.0, 1.0, 0.0)])
