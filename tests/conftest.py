@@ -18,7 +18,7 @@ import pytest
 import torch
 from examples import MANY
 from filelock import FileLock
-from fog import fog, foggy_cells
+from fog import CUBE, fog
 from hypothesis import settings
 
 from nerfcli.atomic import write_json
@@ -138,8 +138,7 @@ def finished(capture: Path) -> Path:
     run = capture.with_name("spheres-run")
     loaded = load_scene(capture)
     similarity, _ = object_frame(loaded)
-    cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-    write_run(run, loaded, fog(cells, similarity, background=(1.0, 1.0, 1.0), step=1 / 32), factor=8)
+    write_run(run, loaded, fog(CUBE, similarity, background=(1.0, 1.0, 1.0), step=1 / 32), factor=8)
     return run
 
 

@@ -26,6 +26,9 @@ def foggy_cells(low: tuple[float, float, float], high: tuple[float, float, float
     return z[:, None, None] & y[None, :, None] & x[None, None, :]
 
 
+CUBE = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+
+
 def fog(
     occupied: Tensor,
     training_from_scene: Similarity,

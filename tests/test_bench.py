@@ -10,7 +10,7 @@ import pytest
 import torch
 from commands import error_of, nerfcli
 from conftest import write_run
-from fog import fog, foggy_cells
+from fog import CUBE, fog
 from full_disk import files_of_at_most
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -62,7 +62,7 @@ def foggy(spheres: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the spheres in which nothing was trained: a cube of fog. Shared by tests, so do not write into it."""
     run = tmp_path_factory.mktemp("foggy") / "run"
     similarity, _ = object_frame(spheres)
-    model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), similarity, background=(1.0, 1.0, 1.0), step=1 / 16)
+    model = fog(CUBE, similarity, background=(1.0, 1.0, 1.0), step=1 / 16)
     with torch.no_grad():
         dict(model.field.named_parameters())["weights.1"][0, 0] = 0.1
     write_run(run, spheres, model, factor=4)
@@ -119,7 +119,7 @@ def test_every_setting_has_one_name_and_changes_what_it_says():
 
 def towards_fog() -> tuple[Model, HeldOutPhoto]:
     """Return a cube of fog, and an all-black photo that looks at it along z."""
-    model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), Similarity(1.0, np.eye(3), np.zeros(3)), step=1 / 37)
+    model = fog(CUBE, Similarity(1.0, np.eye(3), np.zeros(3)), step=1 / 37)
     pose = from_parts(np.eye(3), np.array([0.1, -0.05, -2.0]))
     frame = Frame("a", Camera("PINHOLE", 24, 18, (30.0, 30.0, 12.0, 9.0)), pose)
     return model, HeldOutPhoto(frame, np.zeros((18, 24, 3), np.uint8), None)

@@ -11,7 +11,7 @@ import pytest
 import tifffile
 import torch
 from commands import completed, error_of, nerfcli
-from fog import fog, foggy_cells
+from fog import CUBE, fog
 from present import present
 
 from nerfcli.cameras.camera import Camera
@@ -193,7 +193,7 @@ def test_nothing_is_seen_beyond_the_edges_of_the_picture():
 
 def test_depths_of_a_field_are_those_of_its_surface():
     """A cube of fog: half of the light ends ln 2 / density behind its face."""
-    model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), Similarity(0.5, np.eye(3), np.zeros(3)))
+    model = fog(CUBE, Similarity(0.5, np.eye(3), np.zeros(3)))
     pose = look_at(np.array([0.0, 0.0, -4.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
     frame = Frame("a", Camera("SIMPLE_RADIAL", 400, 300, (300.0, 200.0, 150.0, -0.05)), pose)
     (view,) = depth_maps(model, [frame], max_size=40)

@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import tifffile
-from fog import fog, foggy_cells
+from fog import CUBE, fog
 from PIL import Image
 from present import present
 
@@ -48,8 +48,7 @@ def frame(name: str, distance: float = 2.0) -> Frame:
 @pytest.fixture
 def model() -> Model:
     """A cube of fog in metres, said to be measured by GPS."""
-    cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-    foggy = fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32, unit="metre")
+    foggy = fog(CUBE, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32, unit="metre")
     return replace(foggy, unit_source="gps")
 
 

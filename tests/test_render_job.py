@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fog import fog, foggy_cells
+from fog import CUBE, fog
 from present import present
 
 from nerfcli import atomic
@@ -44,8 +44,7 @@ def model() -> Model:
 
 
 def foggy() -> Model:
-    cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-    return fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32)
+    return fog(CUBE, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32)
 
 
 def job_of(count: int = 4, *, convention: str = "conditional", video: VideoSettings | None = VIDEO) -> RenderJob:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import Browser, needs_browser
-from fog import fog, foggy_cells
+from fog import CUBE, fog
 from markupsafe import escape
 from present import present
 
@@ -89,9 +89,7 @@ def facts(label: str = "a run", **changes: Any) -> RunFacts:
 
 
 PHOTO = np.full((8, 10, 3), 128, np.uint8)
-MODEL = fog(
-    foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32
-)
+MODEL = fog(CUBE, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32)
 
 
 @pytest.fixture(scope="module")
