@@ -23,16 +23,14 @@ from rich.table import Table
 from torch import Tensor
 
 from nerfcli import kernels
-from nerfcli.ct.baselines import logarithms
-from nerfcli.ct.evaluate import evaluate_scan, held_out_air, score_projections, score_volume
-from nerfcli.ct.formats.read import read_scan
+from nerfcli.ct.convert import read_scan
+from nerfcli.ct.evaluate import evaluate_scan, held_out_air, logarithms, score_projections, score_volume
 from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.grid import VoxelGrid
 from nerfcli.ct.reconstruct import Projector
 from nerfcli.ct.result import Reconstruction, ReconstructionSettings, scan_of
-from nerfcli.ct.scan import Scan, save_scan
+from nerfcli.ct.scan import Scan, load_truth, save_scan
 from nerfcli.ct.train import train_scan
-from nerfcli.ct.truth import load_truth
 from nerfcli.machine import Resources
 from nerfcli.notices import Reporter
 from nerfcli.output import Output

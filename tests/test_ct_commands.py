@@ -22,15 +22,13 @@ from nerfcli.ct.evaluate import score_projections, score_volume
 from nerfcli.ct.export import VolumeFile, export_scan, write_volume
 from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.geometry import ScanGeometry
-from nerfcli.ct.grid import VoxelGrid, centred_grid
+from nerfcli.ct.grid import UNSEEN, VoxelGrid, centred_grid, marks
 from nerfcli.ct.likelihood import Gaussian, Poisson
-from nerfcli.ct.marks import UNSEEN, marks
 from nerfcli.ct.render import residual_of, slice_of
 from nerfcli.ct.result import ReconstructionSettings, load_reconstruction, save_reconstruction
 from nerfcli.ct.result import scan_of as scan_behind
-from nerfcli.ct.scan import save_scan
+from nerfcli.ct.scan import described_truth, save_scan
 from nerfcli.ct.train import train_scan
-from nerfcli.ct.truth import described_truth
 from nerfcli.errors import BAD_INPUT, OUT_OF_MEMORY, UserError
 from nerfcli.interrupts import Terminated
 from nerfcli.notices import Reporter

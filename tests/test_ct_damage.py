@@ -26,7 +26,7 @@ from scan_files import (
     stack,
 )
 
-from nerfcli.ct.formats.read import read_scan
+from nerfcli.ct.convert import read_scan
 from nerfcli.ct.scan import load_scan
 from nerfcli.errors import BAD_INPUT
 

@@ -8,13 +8,12 @@ import pytest
 from commands import completed, error_of, nerfcli
 from scan_files import WRITERS, Written, nikon, stack
 
+from nerfcli.ct.convert import read_scan
 from nerfcli.ct.formats.assemble import axis_column
-from nerfcli.ct.formats.read import read_scan
 from nerfcli.ct.formats.statement import ScanOptions
 from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.recognise import recognise
-from nerfcli.ct.scan import load_scan
-from nerfcli.ct.truth import load_truth
+from nerfcli.ct.scan import load_scan, load_truth
 
 
 def pixels_by_formula(written: Written, geometry: ScanGeometry) -> tuple[np.ndarray, np.ndarray]:

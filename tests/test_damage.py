@@ -30,7 +30,7 @@ from nerfcli.captures.capture import Capture
 from nerfcli.captures.formats.format import UserInputs
 from nerfcli.captures.formats.ply import read_points
 from nerfcli.captures.formats.registry import format_named, recognise
-from nerfcli.ct.formats.read import read_scan
+from nerfcli.ct.convert import read_scan
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors

@@ -11,9 +11,9 @@ import torch
 from commands import error_of, nerfcli
 from ellipsoids import Ellipsoid, attenuation_at, attenuation_of_voxels, bean, line_integrals
 
-from nerfcli.ct.formats.read import read_scan
+from nerfcli.ct.convert import read_scan
 from nerfcli.ct.likelihood import likelihood_of
-from nerfcli.ct.truth import load_truth
+from nerfcli.ct.scan import load_truth
 
 PHANTOM = Path(__file__).parent.parent / "sample_scenes" / "phantom"
 

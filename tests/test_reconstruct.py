@@ -12,14 +12,22 @@ from scipy.ndimage import binary_erosion
 from tomography import sart_total_variation
 
 from nerfcli.ct import reconstruct as reconstruction
-from nerfcli.ct.baselines import filtered_back_projection, logarithms
 from nerfcli.ct.calibrate import air_factors, detector_tilt, found_noise
-from nerfcli.ct.evaluate import resampled, score_projections, score_volume
+from nerfcli.ct.centre import highest_contrast_row
+from nerfcli.ct.evaluate import filtered_back_projection, logarithms, resampled, score_projections, score_volume
 from nerfcli.ct.geometry import Circle, ScanGeometry
-from nerfcli.ct.grid import VoxelGrid, centred_grid, grid_of_scan
+from nerfcli.ct.grid import (
+    OUTSIDE,
+    TRUNCATED,
+    UNSEEN,
+    WEDGE,
+    VoxelGrid,
+    centred_grid,
+    grid_of_scan,
+    marks,
+    missing_wedge_deg,
+)
 from nerfcli.ct.likelihood import Gaussian, Poisson, likelihood_of, noise, photons_per_value, with_noise
-from nerfcli.ct.marks import OUTSIDE, TRUNCATED, UNSEEN, WEDGE, marks, missing_wedge_deg
-from nerfcli.ct.quick import highest_contrast_row
 from nerfcli.ct.reconstruct import Problem, Projector, reconstruct, start
 from nerfcli.ct.scan import Scan, held_out_views, load_scan, save_scan
 from nerfcli.ct.train import seconds_left

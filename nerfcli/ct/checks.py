@@ -6,11 +6,22 @@ from functools import cached_property
 import numpy as np
 from skimage.filters import threshold_otsu
 
-from nerfcli.ct.centre import FEWEST_VIEWS, FINE, SIGNIFICANT, Centre, centre_of, margin
+from nerfcli.ct.centre import (
+    FEWEST_VIEWS,
+    FINE,
+    SIGNIFICANT,
+    Centre,
+    Row,
+    centre_of,
+    grid_of_row,
+    highest_contrast_row,
+    margin,
+    predicted,
+    reconstructed,
+)
 from nerfcli.ct.formats.assemble import axis_column
-from nerfcli.ct.marks import WEDGE_DEG, gaps_deg
+from nerfcli.ct.grid import WEDGE_DEG, gaps_deg
 from nerfcli.ct.open_beam import MEDIAN_DEVIATION
-from nerfcli.ct.quick import Row, grid_of_row, highest_contrast_row, predicted, reconstructed
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import several
 from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, finding, verdict_above, verdict_below, worst

@@ -9,8 +9,7 @@ import numpy as np
 
 from nerfcli.ct import checks
 from nerfcli.ct.checks import Sample, sample_of
-from nerfcli.ct.describe import in_words
-from nerfcli.ct.formats.read import read_scan
+from nerfcli.ct.convert import in_words, read_scan
 from nerfcli.ct.formats.statement import ScanOptions
 from nerfcli.ct.scan import Scan
 from nerfcli.notices import Progress, Reporter, no_progress

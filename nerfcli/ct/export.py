@@ -15,8 +15,7 @@ import numpy as np
 import tifffile
 
 from nerfcli.atomic import atomic_path
-from nerfcli.ct.grid import VoxelGrid
-from nerfcli.ct.marks import MEANINGS, UNSEEN, marks_in_words
+from nerfcli.ct.grid import MEANINGS, UNSEEN, VoxelGrid, marks_in_words
 from nerfcli.ct.recognise import VOLUMES
 from nerfcli.ct.result import load_reconstruction
 from nerfcli.errors import UserError
@@ -55,7 +54,7 @@ def export_scan(
     """Write the volume of a reconstruction as .nrrd, .mha, .nii or .tif, and its marks beside it.
 
     Voxels that no view sees are NaN. TARGET-marks has the marks of all voxels that the views do not determine, see
-    `marks`; it is written only if there are any.
+    `grid.marks`; it is written only if there are any.
 
     Args:
         run: the folder that `train_scan` wrote.

@@ -8,9 +8,8 @@ import torch
 
 from nerfcli.atomic import atomic_path
 from nerfcli.ct.evaluate import held_out_air
-from nerfcli.ct.grid import VoxelGrid
+from nerfcli.ct.grid import MEANINGS, UNSEEN, VoxelGrid
 from nerfcli.ct.likelihood import Likelihood, likelihood_of
-from nerfcli.ct.marks import MEANINGS, UNSEEN
 from nerfcli.ct.reconstruct import Projector
 from nerfcli.ct.result import Reconstruction, load_reconstruction, scan_of
 from nerfcli.errors import UserError

@@ -1,7 +1,7 @@
 """A reconstruction: the volume that was fitted to a scan, and the run folder that holds it.
 
 RUN/reconstruction.json records what was fitted, how, and the decisions taken; RUN/volume.npy holds the attenuation, and
-RUN/marks.npy marks the voxels that the views do not determine, see `marks`.
+RUN/marks.npy marks the voxels that the views do not determine, see `grid`.
 """
 
 import math
@@ -76,7 +76,7 @@ class Reconstruction:
 
     Args:
         volume: (Z, Y, X) attenuation in 1 / unit, float32.
-        marks: (Z, Y, X) uint8, see `marks`.
+        marks: (Z, Y, X) uint8, see `grid`.
         grid: position and size of its voxels.
         unit: unit of lengths.
         scan: folder of the scan, as the user named it.
@@ -86,7 +86,7 @@ class Reconstruction:
         decisions: a sentence for each setting that was decided by the data.
         passes, seconds: passes of the fit, and seconds in total.
         settled: whether the last pass hardly changed the volume.
-        missing_wedge_deg: range of directions without rays, see `marks.missing_wedge_deg`.
+        missing_wedge_deg: range of directions without rays, see `grid.missing_wedge_deg`.
         versions: versions of the programs used.
         complete: False if the fit was interrupted.
     """

@@ -15,13 +15,11 @@ import torch
 
 from nerfcli.atomic import clear_leftovers, exclusive
 from nerfcli.ct.calibrate import air_factors, beside_object, detector_tilt, found_noise
-from nerfcli.ct.centre import FEWEST_VIEWS, centre_of
+from nerfcli.ct.centre import FEWEST_VIEWS, centre_of, highest_contrast_row
 from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.geometry import ScanGeometry
-from nerfcli.ct.grid import VoxelGrid, grid_of_scan
+from nerfcli.ct.grid import TRUNCATED, UNSEEN, VoxelGrid, grid_of_scan, marks, marks_in_words, missing_wedge_deg
 from nerfcli.ct.likelihood import Poisson, likelihood_of, with_noise
-from nerfcli.ct.marks import TRUNCATED, UNSEEN, marks, marks_in_words, missing_wedge_deg
-from nerfcli.ct.quick import highest_contrast_row
 from nerfcli.ct.recognise import is_reconstruction
 from nerfcli.ct.reconstruct import Fit, Problem, Projector, finer, reconstruct, start
 from nerfcli.ct.result import (

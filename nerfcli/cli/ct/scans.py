@@ -258,7 +258,7 @@ def info(
     console = Console(quiet=True, json_lines=json)
 
     def work(given: Given) -> None:
-        from nerfcli.ct.describe import describe
+        from nerfcli.ct.convert import describe
 
         show_facts(given.path, describe(given.path), console)
 

@@ -14,7 +14,7 @@ from nerfcli.ct.formats.pictures import read_npy
 from nerfcli.ct.formats.statement import Statement, angles_in_radians, read_object
 from nerfcli.ct.geometry import BEAMS, Circle
 from nerfcli.ct.recognise import R2_GAUSSIAN
-from nerfcli.ct.truth import described_truth
+from nerfcli.ct.scan import described_truth
 from nerfcli.errors import UserError
 
 _HINT = "expected R2-Gaussian's meta_data.json: scanner, proj_train and proj_test"

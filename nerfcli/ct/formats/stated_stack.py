@@ -36,8 +36,7 @@ from nerfcli.ct.formats.statement import Statement, angles_in_radians, millimetr
 from nerfcli.ct.geometry import BEAMS, Beam, Circle, ScanGeometry, from_vectors
 from nerfcli.ct.open_beam import OpenBeam, open_beam_of
 from nerfcli.ct.recognise import STACK
-from nerfcli.ct.scan import KINDS
-from nerfcli.ct.truth import described_truth
+from nerfcli.ct.scan import KINDS, described_truth
 from nerfcli.errors import UserError
 
 _HINT = "a scan.json states projections, kind, beam, pixel_size, unit and angles_deg; see docs/tomography.md"

@@ -16,8 +16,7 @@ from nerfcli.ct.formats.pictures import read_npy, read_stack
 from nerfcli.ct.formats.statement import Statement, read_object
 from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.recognise import TRANSFORMS, TRANSFORMS_GEOMETRY
-from nerfcli.ct.scan import Kind
-from nerfcli.ct.truth import described_truth
+from nerfcli.ct.scan import Kind, described_truth
 from nerfcli.errors import UserError
 
 WHITE = 65535.0
