@@ -158,9 +158,6 @@ def _prediction(scan: Scan, geometry: ScanGeometry, *, binning: int) -> np.ndarr
     fitted, left = views[::2], views[1::2]
     problem = Problem(coarse.select(fitted), likelihood_of(scan, fitted, binning=binning), grid)
     fit = reconstruct(problem, start(problem), strength=TRIAL_STRENGTH, passes=TRIAL_PASSES)
-    projector = Projector(coarse.select(left), grid)
-    every = np.arange(len(left))
-    deviance = likelihood_of(scan, left, binning=binning).deviance(
-        projector.forward(fit.volume, every), torch.from_numpy(every)
-    )
+    predicted = Projector(coarse.select(left), grid).forward(fit.volume)
+    deviance = likelihood_of(scan, left, binning=binning).deviance(predicted, torch.arange(len(left)))
     return np.nanmean(deviance.numpy(), axis=1)

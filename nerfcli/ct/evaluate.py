@@ -168,9 +168,7 @@ def held_out_air(scan: Scan, geometry: ScanGeometry, result: Reconstruction) -> 
     views = np.array(scan.held_out, dtype=int)
     likelihood = likelihood_of(scan, views)
     assert isinstance(likelihood, Poisson)
-    integrals = Projector(geometry.select(views), result.grid).forward(
-        torch.from_numpy(np.array(result.volume)), np.arange(len(views))
-    )
+    integrals = Projector(geometry.select(views), result.grid).forward(torch.from_numpy(np.array(result.volume)))
     return air_factors(likelihood, integrals).numpy()
 
 
@@ -186,13 +184,12 @@ def score_projections(
     views = np.array(scan.held_out, dtype=int)
     if len(views) == 0:
         return None
-    every = np.arange(len(views))
-    predicted = Projector(geometry.select(views), grid).forward(volume, every)
+    predicted = Projector(geometry.select(views), grid).forward(volume)
     likelihood = likelihood_of(scan, views, air=air)
     measured = scan.line_integrals(views).reshape(len(views), -1)
     if air is not None:
         measured = measured + np.log(air)[:, None].astype(np.float32)
-    deviance = likelihood.deviance(predicted, torch.from_numpy(every)).numpy()
+    deviance = likelihood.deviance(predicted, torch.arange(len(views))).numpy()
     usable = np.isfinite(deviance) & np.isfinite(measured)
     if not usable.any():
         return None

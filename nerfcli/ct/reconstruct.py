@@ -25,6 +25,7 @@ from nerfcli.ct.geometry import ScanGeometry
 from nerfcli.ct.grid import VoxelGrid
 from nerfcli.ct.likelihood import Likelihood
 from nerfcli.kernels.reference import total_variation
+from nerfcli.notices import Progress, no_progress
 
 # Approximate number of views per subset: with fewer, a pass has more steps, but each approximates all views less well.
 VIEWS_OF_SUBSET = 5
@@ -124,8 +125,8 @@ def reconstruct(
     strength: float,
     passes: int | None = None,
     seconds: float | None = None,
-    progress: Callable[[float, str], None] | None = None,
-    keep: Callable[[Fit], None] | None = None,
+    progress: Progress = no_progress,
+    keep: Callable[[Fit], None] = lambda fit: None,
 ) -> Fit:
     """Continue a fit until the passes or the time are used up, or it has converged.
 
@@ -173,11 +174,8 @@ def reconstruct(
                 ahead = moved + (inertia - 1) / following * (moved - volume)
                 inertia = following
             volume = moved
-            if progress is not None:
-                progress(
-                    _fraction(done + (number + 1) / len(subsets), passes, time.perf_counter() - begun, seconds),
-                    f"pass {fit.passes + done + 1}",
-                )
+            fraction = _fraction(done + (number + 1) / len(subsets), passes, time.perf_counter() - begun, seconds)
+            progress(fraction, f"pass {fit.passes + done + 1}")
         done += 1
         if objective < best:
             best, best_volume = objective, before
@@ -186,8 +184,7 @@ def reconstruct(
             ahead, volume, inertia = best_volume, best_volume, 1.0
         settled = float((volume - before).norm()) <= SETTLED * max(float(volume.norm()), 1e-30)
         spent = time.perf_counter() - begun
-        if keep is not None:
-            keep(Fit(volume, dual, fit.passes + done, settled))
+        keep(Fit(volume, dual, fit.passes + done, settled))
         over = (passes is not None and done >= passes) or (seconds is not None and spent * (done + 1) / done > seconds)
         if over or (settled and done > 1):
             break

@@ -306,7 +306,7 @@ def _air(
         return None
     strength = settings.strength
     fit = reconstruct(problem, start(problem), strength=strength, passes=COARSE_PASSES, seconds=seconds)
-    integrals = Projector(problem.geometry, problem.grid).forward(fit.volume, np.arange(problem.geometry.views))
+    integrals = Projector(problem.geometry, problem.grid).forward(fit.volume)
     factors = air_factors(binned, integrals)
     photons = torch.where(beside_object(binned, integrals), binned.counts, 0).sum(1)
     error = float((1 / photons.clamp_min(1)).sqrt().median())

@@ -31,10 +31,10 @@ def numbered(folder: Path, pattern: str = "*", *, without: str | None = None) ->
         and path.suffix.lower() in SUFFIXES
         and not (without and re.search(without, path.name, re.IGNORECASE))
     ]
-    numbers = [_number(path) for path in paths]
-    if len(paths) < 2 or None in numbers:
+    numbers = [re.findall(r"\d+", path.stem) for path in paths]
+    if len(paths) < 2 or not all(numbers):
         return paths
-    present = [number for number in numbers if number is not None]
+    present = [int(found[-1]) for found in numbers]
     twice = sorted(paths[k].name for k in range(len(present)) if present.count(present[k]) > 1)
     if twice:
         raise UserError(
@@ -116,8 +116,3 @@ def _pages(path: Path) -> np.ndarray:
     if array.ndim != 3 or array.shape[-1] in (3, 4):
         raise UserError(f"{path} has the shape {array.shape}", "projections are grey: rows x columns, or pages of them")
     return array.astype(np.float32)
-
-
-def _number(path: Path) -> int | None:
-    found = re.findall(r"\d+", path.stem)
-    return int(found[-1]) if found else None
