@@ -12,35 +12,20 @@ import zlib  # noqa: F401
 
 from nerfcli.version import __version__ as __version__
 
-__all__ = [
-    "Output",
-    "Reporter",
-    "Resources",
-    "estimate_poses",
-    "evaluate_run",
-    "export_run",
-    "load_run",
-    "load_scene",
-    "load_splats",
-    "render_run",
-    "run_pipeline",
-    "train_scene",
-]
-
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from nerfcli.captures.loading import load_scene
-    from nerfcli.machine import Resources
-    from nerfcli.notices import Reporter
-    from nerfcli.output import Output
-    from nerfcli.training.runs.run import load_run
-    from nerfcli.workflows.evaluate import evaluate_run
-    from nerfcli.workflows.export import export_run
-    from nerfcli.workflows.pipeline import run_pipeline
-    from nerfcli.workflows.poses import estimate_poses
-    from nerfcli.workflows.render import render_run
-    from nerfcli.workflows.splats import load_splats
-    from nerfcli.workflows.train import train_scene
+    from nerfcli.captures.loading import load_scene as load_scene
+    from nerfcli.machine import Resources as Resources
+    from nerfcli.notices import Reporter as Reporter
+    from nerfcli.output import Output as Output
+    from nerfcli.training.runs.run import load_run as load_run
+    from nerfcli.workflows.evaluate import evaluate_run as evaluate_run
+    from nerfcli.workflows.export import export_run as export_run
+    from nerfcli.workflows.pipeline import run_pipeline as run_pipeline
+    from nerfcli.workflows.poses import estimate_poses as estimate_poses
+    from nerfcli.workflows.render import render_run as render_run
+    from nerfcli.workflows.splats import load_splats as load_splats
+    from nerfcli.workflows.train import train_scene as train_scene
 
 _MODULES = {
     "Output": "nerfcli.output",
@@ -56,6 +41,7 @@ _MODULES = {
     "run_pipeline": "nerfcli.workflows.pipeline",
     "train_scene": "nerfcli.workflows.train",
 }
+__all__ = [*_MODULES]
 
 
 def __getattr__(name: str) -> object:
