@@ -83,7 +83,8 @@ def rough(field: Field, *, sky: bool = False) -> Model:
 def page_of(model: Model, frames: list[Frame], proof: Proof) -> str:
     box = (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
     scene = scene_of(model, run=Path("a run"), frames=frames, photos=[], box=box)
-    return page_html(scene, numbers_of(pack_model(model), proof, UNSEEN))
+    description, numbers = numbers_of(pack_model(model), proof, UNSEEN)
+    return page_html(scene | description, numbers)
 
 
 def hash_settings(contraction: str, *, antialias: bool = False, view_degree: int = 3) -> HashFieldSettings:
@@ -229,7 +230,7 @@ def test_photos_are_shown_though_their_masks_are_gone(spheres_run, tmp_path):
     masked = replace(cameras.train[0], mask=tmp_path / "gone.png")
     photos = [page_photos(cameras.exposures, [frame], [], room_bytes=10**6) for frame in (masked, cameras.train[0])]
     assert photos[0] == photos[1]
-    assert photos[0].entries[0]["picture"].startswith("data:image/jpeg")
+    assert photos[0][0][0]["picture"].startswith("data:image/jpeg")
 
 
 # In a browser

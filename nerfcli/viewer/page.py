@@ -35,12 +35,6 @@ def numbers_of(packed: PackedField, proof: Proof, seen: np.ndarray) -> tuple[dic
     return description, "\n".join(starmap(page.array_element, arrays.items()))
 
 
-def page_html(scene: dict[str, Any], numbers: tuple[dict[str, Any], str]) -> str:
-    """Return the text of a page that needs no server."""
-    description, elements = numbers
-    return _html(scene | description, elements)
-
-
 def live_page_html(scene: dict[str, Any], *, version: int, refusal: str | None, far: float) -> str:
     """Return the text of a page that fetches its field and pictures from the server that sent it.
 
@@ -51,7 +45,7 @@ def live_page_html(scene: dict[str, Any], *, version: int, refusal: str | None, 
         far: end of the rays, training frame.
     """
     live = {"live": {"refusal": refusal, "version": version}, "march": {"far": far}}
-    return _html(scene | live, "")
+    return page_html(scene | live, "")
 
 
 def scene_of(
@@ -86,7 +80,13 @@ def scene_of(
     }
 
 
-def _html(scene: dict[str, Any], numbers: str) -> str:
+def page_html(scene: dict[str, Any], numbers: str) -> str:
+    """Return the text of a page.
+
+    Args:
+        scene: see `scene_of`, with the plain values of `numbers_of`; or "live" for a page that fetches its field.
+        numbers: the elements of `numbers_of`.
+    """
     shaders = "".join(
         f'<script type="x-shader/x-fragment" id="{part}">{_text(f"{part}.glsl")}</script>' for part in ("trace", "show")
     )

@@ -29,14 +29,6 @@ MOST_PICTURES = 200
 _SAMPLE = 4
 
 
-@dataclass(frozen=True)
-class PagePhotos:
-    """Entries of the photos of a page, plain values, and the number of those that are not where the run has them."""
-
-    entries: list[dict[str, Any]]
-    missing: int
-
-
 def page_photos(
     exposures: PhotoExposures,
     train: Sequence[Frame],
@@ -44,8 +36,8 @@ def page_photos(
     *,
     room_bytes: int,
     on_progress: Callable[[float], None] = lambda fraction: None,
-) -> PagePhotos:
-    """Return the photos of a run, undistorted to pinhole cameras, sorted by name.
+) -> tuple[list[dict[str, Any]], int]:
+    """Return the entries of a run's photos, undistorted to pinhole cameras, sorted by name, and how many are missing.
 
     Args:
         room_bytes: budget for all pictures, as text in the page.
@@ -62,7 +54,7 @@ def page_photos(
             pictures[index] = data_uri(jpeg, "jpeg")
             on_progress((count + 1) / len(of))
     entries = [{**entry, "picture": pictures.get(index)} for index, entry in enumerate(_entries(exposures, frames))]
-    return PagePhotos(entries, len(frames) - len(there))
+    return entries, len(frames) - len(there)
 
 
 def fetched_photos(exposures: PhotoExposures, train: Sequence[Frame], test: Sequence[Frame]) -> list[dict[str, Any]]:

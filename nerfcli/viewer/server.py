@@ -104,7 +104,16 @@ class _Handler(BaseHTTPRequestHandler):
         return self.server
 
     def do_GET(self) -> None:
-        self._answer({"": self._page, "version": self._version, "field": self._field, "proof": self._proof})
+        show, binary = self._of.show, "application/octet-stream"
+        self._answer(
+            {
+                "": self._page,
+                "photo": self._photo,
+                "version": lambda: self._send(HTTPStatus.OK, "application/json", json.dumps(show.version())),
+                "field": lambda: self._send(HTTPStatus.OK, binary, show.field()),
+                "proof": lambda: self._send(HTTPStatus.OK, binary, show.proof()),
+            }
+        )
 
     def do_POST(self) -> None:
         self._answer({"picture": self._picture})
@@ -118,9 +127,7 @@ class _Handler(BaseHTTPRequestHandler):
             )
             return
         self._query = {name: values[-1] for name, values in parse_qs(address.query).items()}
-        handle = places.get(place.rstrip("/"))
-        if self.command == "GET" and place == "photo":
-            handle = self._photo
+        handle = places.get(place)
         if handle is None:
             self._send(HTTPStatus.NOT_FOUND, "text/plain", "there is nothing here\n")
             return
@@ -141,15 +148,6 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain; charset=utf-8", text, {"Refresh": "2"})
             return
         self._send(HTTPStatus.OK, "text/html; charset=utf-8", text)
-
-    def _version(self) -> None:
-        self._send(HTTPStatus.OK, "application/json", json.dumps(self._of.show.version()))
-
-    def _field(self) -> None:
-        self._send(HTTPStatus.OK, "application/octet-stream", self._of.show.field())
-
-    def _proof(self) -> None:
-        self._send(HTTPStatus.OK, "application/octet-stream", self._of.show.proof())
 
     def _photo(self) -> None:
         content = self._of.show.photo(int(self._query.get("n", "")), int(self._query.get("px", "800")))

@@ -105,23 +105,23 @@ def _export_page(run: Run, model: Model, path: Path, *, settings: SurfaceSetting
     proof = make_proof(model, frames)
     reporter.progress(0.1, "depths of the training photos")
     seen = photo_depths(run, model, reporter, begin=0.1, end=0.4)
-    numbers = numbers_of(packed, proof, seen_cells(model, seen))
-    text_bytes = len(numbers[1])
-    photos = page_photos(
+    description, numbers = numbers_of(packed, proof, seen_cells(model, seen))
+    text_bytes = len(numbers)
+    photos, missing = page_photos(
         run.cameras.exposures,
         cameras.train,
         cameras.test,
         room_bytes=PAGE_BYTES - text_bytes - 150_000,
         on_progress=reporter.part(0.4, 1.0, "photos"),
     )
-    if photos.missing:
-        reporter.note(f"{photos.missing} photos are missing: the page shows only their cameras")
+    if missing:
+        reporter.note(f"{missing} photos are missing: the page shows only their cameras")
     if text_bytes > PAGE_BYTES:
         reporter.note(
             f"the field alone needs {text_bytes / 1e6:.0f} MB of text: the page is large and contains no photos"
         )
-    scene = scene_of(model, run=run.path, frames=frames, photos=photos.entries, box=box)
-    write_page(page_html(scene, numbers), path)
+    scene = scene_of(model, run=run.path, frames=frames, photos=photos, box=box)
+    write_page(page_html(scene | description, numbers), path)
 
 
 FORMAT = "nerfcli geometry 1"
