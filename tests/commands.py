@@ -57,6 +57,12 @@ def listing(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+def in_python(program: str) -> subprocess.CompletedProcess[str]:
+    """Run a program in a Python process of its own, and return its exit code and what it printed."""
+    command = [sys.executable, "-c", program]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+
+
 def started(*arguments: str | Path) -> subprocess.Popen[str]:
     """Start a command that reacts to Ctrl-C as in a terminal, even if a suite in the background ignores SIGINT."""
     program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "

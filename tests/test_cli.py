@@ -204,6 +204,7 @@ def test_what_is_no_time(text):
         ("train x --budget 2", "'2' has no unit; write 2s or 2m"),
         ("view x --port 80000", "'80000' is too large; give at most 65535"),
         ("ablate x --seeds 0", "'0' is too small; give at least 1"),
+        ("ablate x --only magic", "--only: 'magic'; choose from background"),
         ("train x --seed 4294967296", "'4294967296' is too large; give at most 4294967295"),
         ("render x --fps 5", "--fps: it works with --video"),
         ("render x --background-distance 5", "it works with --depth background"),
@@ -480,20 +481,20 @@ def test_there_is_no_place_beside_the_root():
     )
 
 
-def test_many_inputs_share_one_output_folder(capture, tmp_path):
-    result = nerfcli("train", "-", *QUICK, "-o", tmp_path / "runs", stdin=f"{capture}\n")
-    assert result.stdout.splitlines() == [str(tmp_path / "runs" / "spheres-run")]
+@pytest.fixture
+def exported(monkeypatch) -> list[Path]:
+    """The paths to which runs would be exported."""
+    paths = []
+    export = "nerfcli.workflows.export.export_run"
+    monkeypatch.setattr(export, lambda run, output, **more: paths.append(output.path) or output.path)
+    return paths
 
 
-def test_results_of_inputs_of_one_name_do_not_replace_each_other(monkeypatch, stop_at, tmp_path):
-    written = []
-    monkeypatch.setattr(
-        "nerfcli.workflows.export.export_run", lambda run, output, **more: written.append(output.path) or output.path
-    )
+def test_results_of_inputs_of_one_name_do_not_replace_each_other(exported, stop_at, tmp_path):
     lines = "\n".join(("a/run", "b/run", "a/kitchen", "b/kitchen", "a/kitchen"))
     result = nerfcli("export", "-", "--to", "points", "--overwrite", "-o", tmp_path, stdin=lines)
     names = ("a-run-points.ply", "b-run-points.ply", "kitchen-points.ply", "kitchen-points.ply")
-    assert written == [tmp_path / name for name in names]  # the last one is the same input again
+    assert exported == [tmp_path / name for name in names]  # the last one is the same input again
     assert error_of(result)[0].endswith("is the result of a/kitchen, which has the same name")
 
     stop_at("workflows.pipeline.run_pipeline", "workflows.convert.convert_capture", "ct.convert.convert_scan")
@@ -517,13 +518,9 @@ def test_a_batch_goes_on_after_paths_that_cannot_be_opened(finished, tmp_path):
     assert result.stdout.splitlines() == [str(finished / "metrics.json")]
 
 
-def test_export_adds_the_suffix_of_its_format(monkeypatch, tmp_path):
-    written = []
-    monkeypatch.setattr(
-        "nerfcli.workflows.export.export_run", lambda run, output, **more: written.append(output.path) or output.path
-    )
+def test_export_adds_the_suffix_of_its_format(exported, tmp_path):
     assert nerfcli("export", "x", "--to", "mesh", "--format", "glb", "-o", tmp_path / "kitchen").exit_code == 0
-    assert written == [tmp_path / "kitchen.glb"]
+    assert exported == [tmp_path / "kitchen.glb"]
 
 
 @pytest.mark.parametrize("command", BATCH_COMMANDS)
@@ -712,6 +709,7 @@ def test_cameras_of_another_file_and_none_at_all(capture, finished, tmp_path):
     assert nerfcli(*arguments, "--cameras", capture).exit_code == 0
     assert len(list((tmp_path / "views" / "rgb").rglob("*.png"))) == 5
     assert "no cameras found at somewhere" in refusal(*arguments, "--cameras", "somewhere")[0]
+    assert "--through cannot be used" in refusal(*arguments, "--through", "r_001.png", exit_code=USAGE)[0]
 
 
 def views_of(folder: Path) -> list[dict[str, Any]]:
@@ -721,9 +719,12 @@ def views_of(folder: Path) -> list[dict[str, Any]]:
 
 def test_views_are_written_and_rendered_from_again(finished, tmp_path):
     path = ("--cameras", "interpolate", "--through", "r_001,r_003.png", "--count", "3", "--max-size", "10")
-    result = nerfcli("render", finished, *path, "--cameras-only", "-o", tmp_path / "path")
-    assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'path'}\n")
-    assert set(listing(tmp_path / "path")) == {"camera_path.json", "cameras.json"}
+    of_views = ("render", finished, *path, "--cameras-only", "-o", tmp_path / "path")
+    assert completed(*of_views).stdout == f"{tmp_path / 'path'}\n"
+    before = listing(tmp_path / "path")
+    assert set(before) == {"camera_path.json", "cameras.json"}
+    assert "exists" in refusal(*of_views)[0]
+    assert listing(tmp_path / "path") == before
     assert nerfcli("render", finished, *path, "--outputs", "rgb", "-o", tmp_path / "views").exit_code == 0
     for name in ("cameras.json", "camera_path.json"):
         again = ("--cameras", tmp_path / "path" / name, "--outputs", "rgb", "-o", tmp_path / name)
@@ -732,19 +733,6 @@ def test_views_are_written_and_rendered_from_again(finished, tmp_path):
             if name == "cameras.json":  # the other format has square pixels only, and says so
                 assert one["camera"] == other["camera"]
             np.testing.assert_allclose(one["world_from_cam"], other["world_from_cam"], rtol=0, atol=1e-12)
-
-
-def test_views_are_not_written_over(finished, tmp_path):
-    arguments = ("render", finished, "--cameras", "orbit", "--count", "2", "--cameras-only", "-o")
-    assert nerfcli(*arguments, tmp_path / "path").exit_code == 0
-    before = listing(tmp_path / "path")
-    result = nerfcli(*arguments, tmp_path / "path")
-    assert (result.exit_code, listing(tmp_path / "path")) == (BAD_INPUT, before)
-    assert "exists" in error_of(result)[0]
-
-
-def test_photos_of_a_path_are_wrong_usage_for_other_views(finished):
-    assert nerfcli("render", finished, "--through", "r_001.png").exit_code == 2
 
 
 @pytest.mark.parametrize("is_archive", [False, True])

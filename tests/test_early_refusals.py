@@ -2,12 +2,11 @@
 
 import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from commands import completed, error_of, listing, nerfcli, refusal
+from commands import completed, error_of, in_python, listing, nerfcli, refusal
 from test_cli import COMMANDS
 
 from nerfcli.errors import BAD_INPUT
@@ -57,9 +56,8 @@ def test_a_scan_is_recognised_before_anything_heavy_is_loaded():
         f"try: app(['train', {str(PHANTOM)!r}])\n"
         "finally: print(*{'torch', 'numpy', 'scipy', 'h5py'} & set(sys.modules))"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == BAD_INPUT
-    assert done.stdout.split() == []
+    done = in_python(program)
+    assert (done.returncode, done.stdout.split()) == (BAD_INPUT, [])
 
 
 def test_json_nested_too_deeply_is_refused_and_not_a_traceback(tmp_path):
@@ -70,34 +68,28 @@ def test_json_nested_too_deeply_is_refused_and_not_a_traceback(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "options", "said"),
+    ("command", "name", "options", "said"),
     [
-        ("clip.mp4", ("--masks", "nowhere"), "the mask folder {0}/nowhere does not exist"),
-        ("clip.mp4", ("-o", "."), "cannot write the scene .: the folder contains other files"),
+        ("poses", "clip.mp4", ("--masks", "nowhere"), "the mask folder {0}/nowhere does not exist"),
+        ("poses", "clip.mp4", ("-o", "."), "cannot write the scene .: the folder contains other files"),
         pytest.param(
-            *(os.fsdecode(b"caf\xe9.mp4"), (), "the name 'caf\\udce9-frames' is not in UTF-8"),
+            *("poses", os.fsdecode(b"caf\xe9.mp4"), (), "the name 'caf\\udce9-frames' is not in UTF-8"),
             marks=pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such names"),
         ),
-        ("photos.zip", ("--masks", "nowhere"), "the mask folder {0}/nowhere does not exist"),
-        ("clip.mp4", ("--pairs", "nowhere"), "cannot read the pairs in {0}/nowhere: No such file"),
-        ("photos.zip", ("--intrinsics", "nowhere"), "nowhere does not exist"),
+        ("poses", "photos.zip", ("--masks", "nowhere"), "the mask folder {0}/nowhere does not exist"),
+        ("poses", "clip.mp4", ("--pairs", "nowhere"), "cannot read the pairs in {0}/nowhere: No such file"),
+        ("poses", "photos.zip", ("--intrinsics", "nowhere"), "nowhere does not exist"),
+        ("run", "clip.mp4", ("--intrinsics", "nowhere"), "nowhere does not exist"),
     ],
 )
-def test_poses_neither_reads_a_video_nor_unpacks_photos_for_a_scene_that_is_refused(
-    name, options, said, tmp_path, monkeypatch
+def test_no_video_is_read_and_no_photos_are_unpacked_for_a_scene_that_is_refused(
+    command, name, options, said, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
     Path(name).write_bytes(b"x")
-    result = nerfcli("poses", name, *options)
+    result = nerfcli(command, name, *options)
     assert (result.exit_code, error_of(result)[0]) == (BAD_INPUT, f"Error: {said.format(tmp_path)}")
     assert list(tmp_path.iterdir()) == [tmp_path / name]
-
-
-def test_run_does_not_read_a_video_if_there_are_no_intrinsics(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("clip.mp4").write_bytes(b"x")
-    assert error_of(nerfcli("run", "clip.mp4", "--intrinsics", "nowhere"))[0] == "Error: nowhere does not exist"
-    assert list(tmp_path.iterdir()) == [tmp_path / "clip.mp4"]
 
 
 @pytest.mark.parametrize("name", ["clip.mp4", "photos.zip"])

@@ -1,7 +1,5 @@
 """The kinds of fields: interpolation against SciPy, harmonics and features in closed form, gradients, checkpoints."""
 
-import math
-from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +10,6 @@ from kernel_parts import radiance_of
 from pools import pool_of_photos
 from present import present
 from scipy.ndimage import map_coordinates
-from scipy.special import sph_harm_y
 
 from nerfcli.cameras.rigid import Similarity, rotation_from_quaternion
 from nerfcli.captures.capture import Capture
@@ -98,12 +95,8 @@ def test_the_dense_grid_interpolates_as_scipy_does(dtype):
     tolerance = 1e-5 if dtype == torch.float32 else 1e-12
     np.testing.assert_allclose(density.detach().log().numpy(), values[:, 0], atol=tolerance)
     np.testing.assert_allclose(field.density(coordinates).detach().log().numpy(), values[:, 0], atol=tolerance)
-    # Harmonics of degree 0 and 1 from SciPy, without its Condon-Shortley phase.
-    x, y, z = directions.double().numpy().T
-    polar, azimuth = np.arccos(z), np.arctan2(y, x)
-    first = np.asarray(sph_harm_y(1, 1, polar, azimuth)) * -math.sqrt(2)
-    basis = (np.full_like(z, 0.5 / math.sqrt(math.pi)), first.imag, sph_harm_y(1, 0, polar, azimuth).real, first.real)
-    colours = sum(y[:, None] * values[:, 1 + 3 * k : 4 + 3 * k] for k, y in enumerate(basis))
+    harmonics = spherical_harmonics(directions.double(), 1)[:, :4].numpy()  # those of SciPy, see test_field
+    colours = np.einsum("nk,nkc->nc", harmonics, values[:, 1:13].reshape(-1, 4, 3))
     np.testing.assert_allclose(rgb.detach().numpy(), 1 / (1 + np.exp(-colours)), atol=tolerance)
 
 
@@ -257,30 +250,6 @@ def test_gradients_are_scaled_up_to_the_nearest_point_or_the_unit_ball(begin, ne
     monkeypatch.setattr(backend, "render_rays", render_rays)
     training.advance(0.5)
     assert given == [pytest.approx(wanted)]
-
-
-def test_the_state_of_the_optimiser_comes_back(field):
-    def stepped(optimiser: FieldOptimiser, number: int) -> None:
-        optimiser.zero_grad()
-        density, rgb = radiance_of(field, places(9), looks(9), torch.arange(9))
-        (density.sum() + rgb.sum()).backward()
-        rows = field.rows()
-        if rows is not None and field.table_grad is not None and rows.grad is not None:
-            field.table_grad.add_(rows.grad)
-            rows.grad = None
-        optimiser.step(number, 1e-3, decay=field.row_decay)
-
-    first = FieldOptimiser(field)
-    stepped(first, 1)
-    numbers = deepcopy(field.state_dict())
-    second = FieldOptimiser(field)
-    second.restore({name: value.clone() for name, value in first.state().items()})
-    stepped(first, 2)
-    straight = deepcopy(field.state_dict())
-    field.load_state_dict(numbers)
-    stepped(second, 2)
-    for name, value in field.state_dict().items():
-        assert torch.equal(value, straight[name]), name
 
 
 def test_a_model_of_every_kind_comes_back_bit_for_bit(field, tmp_path):

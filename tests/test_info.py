@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import sys
 from dataclasses import replace
 from functools import partial
 
@@ -11,7 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import tifffile
-from commands import nerfcli
+from commands import in_python, nerfcli
 from depth_maps import ALL, FULL_META, META, plain_depth
 from every_format import WITH_PHOTOS
 from PIL import Image
@@ -37,8 +36,8 @@ def test_a_depth_file_is_described_without_torch(tmp_path):
         f"try: app(['info', {str(tmp_path / 'a.png')!r}])\n"
         "finally: print(*{'torch', 'skimage'} & set(sys.modules))"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == ""
+    done = in_python(program)
+    assert (done.returncode, done.stdout.splitlines()[-1]) == (0, "")
 
 
 def test_facts_fit_the_lines_of_a_terminal():

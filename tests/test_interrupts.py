@@ -7,7 +7,7 @@ import threading
 import time
 
 import pytest
-from commands import started
+from commands import in_python, started
 from corner import write_capture
 
 from nerfcli.errors import INTERRUPTED, TERMINATED
@@ -15,16 +15,12 @@ from nerfcli.poses.input.job import repeatedly
 from nerfcli.poses.workspace import workspace
 
 
-def ended(program: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60)
-
-
 def test_pycolmap_leaves_sigterm_alone_and_keeps_its_traces_of_crashes():
     """The handlers of a C++ library answer only real signals, so they are tested in a process of their own."""
     imported = "import os, signal; import nerfcli.cameras.camera; os.kill(os.getpid(), signal.{}); signal.pause()"
-    terminated = ended(imported.format("SIGTERM"))
+    terminated = in_python(imported.format("SIGTERM"))
     assert (terminated.returncode, terminated.stderr) == (-signal.SIGTERM, "")
-    crashed = ended(imported.format("SIGSEGV"))
+    crashed = in_python(imported.format("SIGSEGV"))
     assert crashed.returncode == -signal.SIGSEGV
     assert "SIGSEGV" in crashed.stderr
 
@@ -35,7 +31,7 @@ def test_a_process_that_ignores_sigterm_goes_on_doing_so():
         "from nerfcli.interrupts import install_handlers; install_handlers()\n"
         "import nerfcli.cameras.camera; os.kill(os.getpid(), signal.SIGTERM); print('alive')"
     )
-    assert ended(program).stdout == "alive\n"
+    assert in_python(program).stdout == "alive\n"
 
 
 def test_an_interrupt_that_python_drops_in_a_callback_of_c_comes_again():
@@ -57,7 +53,7 @@ try:
 except Terminated:
     print("heard")
 """
-    done = ended(program)
+    done = in_python(program)
     assert (done.stdout, done.stderr) == ("heard\n", "")
 
 

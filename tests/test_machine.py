@@ -3,15 +3,13 @@
 import ctypes
 import json
 import os
-import subprocess
-import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
 import psutil
 import pytest
 import torch
-from commands import nerfcli
+from commands import in_python, nerfcli
 
 from nerfcli import kernels, machine
 from nerfcli.bench import measurement
@@ -148,9 +146,7 @@ print(faults, resident, resident_bytes(os.getpid()))
 
 
 def _measured(keep: str) -> list[int]:
-    program = _PROGRAM.format(keep=keep)
-    out = subprocess.run([sys.executable, "-c", program], check=True, stdout=subprocess.PIPE, text=True).stdout
-    return [int(number) for number in out.split()]
+    return [int(number) for number in in_python(_PROGRAM.format(keep=keep)).stdout.split()]
 
 
 def test_freed_memory_is_used_again_without_page_faults_until_it_is_returned():
@@ -166,8 +162,7 @@ def test_freed_memory_is_used_again_without_page_faults_until_it_is_returned():
 def test_the_peak_of_memory_is_not_that_of_the_process_that_started_this_one():
     child = "from nerfcli.machine import peak_resident_bytes; print(peak_resident_bytes())"
     parent = f"import subprocess, sys; kept = b'x' * 2**28; subprocess.run([sys.executable, '-c', {child!r}])"
-    out = subprocess.run([sys.executable, "-c", parent], check=True, stdout=subprocess.PIPE, text=True).stdout
-    assert int(out) < 2**27
+    assert int(in_python(parent).stdout) < 2**27
 
 
 def _no_library(name: None) -> object:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import error_of, listing, nerfcli, refusal, started
+from commands import error_of, in_python, listing, nerfcli, refusal, started
 from full_disk import files_of_at_most
 
 from nerfcli import atomic, kernels
@@ -183,9 +183,8 @@ sys.meta_path.insert(0, Interrupting())
 from nerfcli.__main__ import start
 start()
 """
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert ended.returncode == INTERRUPTED
-    assert ended.stderr.splitlines() == ["Interrupted; nothing was begun."]
+    ended = in_python(program)
+    assert (ended.returncode, ended.stderr) == (INTERRUPTED, "Interrupted; nothing was begun.\n")
 
 
 @pytest.mark.parametrize(("came", "code"), [(KeyboardInterrupt, INTERRUPTED), (Terminated, TERMINATED)])
@@ -220,7 +219,7 @@ usage.Command.parse_args = terminated
 sys.argv = ["nerfcli", "info", "photos"]
 start()
 """
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60)
+    ended = in_python(program)
     assert (ended.returncode, ended.stderr) == (TERMINATED, "Ended by SIGTERM; completed work is kept.\n")
 
 

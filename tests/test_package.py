@@ -14,18 +14,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from commands import estimated_poses
+from commands import estimated_poses, in_python
 
 import nerfcli
 from nerfcli.poses import structure_from_motion
 
 ROOT = Path(nerfcli.__file__).parent
 PROJECT = ROOT.parent
-
-
-def in_python(code: str) -> subprocess.CompletedProcess[str]:
-    """Run code in a separate Python process."""
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
 
 
 # zlib before pycolmap
