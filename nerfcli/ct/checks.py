@@ -24,7 +24,7 @@ from nerfcli.ct.grid import WEDGE_DEG, gaps_deg
 from nerfcli.ct.open_beam import MEDIAN_DEVIATION
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import several
-from nerfcli.pages.findings import BAD, GOOD, LOOK, Finding, finding, verdict_above, verdict_below, worst
+from nerfcli.pages.findings import BAD, GOOD, Finding, finding, verdict_above, verdict_below, worst
 
 # Largest numbers of rows and views that are examined, as a sample of all.
 MOST_ROWS, MOST_VIEWS = 32, 400
@@ -138,10 +138,9 @@ def drift(sample: Sample) -> Finding | str:
     pixels = border.shape[1] * max(1, round(BORDER * sample.integrals.shape[2]))
     by_noise = 4 * sample.noise / np.sqrt(pixels)
     number = float(np.sqrt(max((high - low) ** 2 - by_noise**2, 0)))
-    verdict = verdict_above(number, look=DRIFT_LOOK, bad=DRIFT_BAD)
     return finding(
         "drift",
-        verdict,
+        verdict_above(number, look=DRIFT_LOOK, bad=DRIFT_BAD),
         f"air changes by {100 * number:.2g} % between views, in addition to {100 * by_noise:.2g} % of noise",
         number,
         f"look from {100 * DRIFT_LOOK:g} %, bad from {100 * DRIFT_BAD:g} %",
@@ -165,14 +164,12 @@ def rings(sample: Sample) -> Finding | str:
     limit = max(RING_FLOOR, RING_NOISE * sample.noise)
     bad = (np.abs(inner) > limit) & (agree >= RING_VIEWS) & ~steep
     fraction = float(bad.mean())
-    verdict = verdict_above(fraction, look=RINGS_LOOK, bad=RINGS_BAD)
     worst_column = int(np.argmax((np.abs(inner) * bad).max(0))) + 2
     return finding(
         "rings",
-        verdict,
+        verdict_above(fraction, look=RINGS_LOOK, bad=RINGS_BAD),
         f"{100 * fraction:.2g} % of the detector's pixels are off their neighbours in all views by more than "
-        + f"{limit:.2g}"
-        + (f"; the worst is column {worst_column}" if fraction > 0 else ""),
+        f"{limit:.2g}" + (f"; the worst is column {worst_column}" if fraction > 0 else ""),
         fraction,
         f"look from {100 * RINGS_LOOK:g} %, bad from {100 * RINGS_BAD:g} %",
         advice="they cause rings around the axis: take new flats, or mark these pixels unusable",
@@ -192,10 +189,9 @@ def counts(sample: Sample) -> Finding | str:
     wide = max(1, min(5, sample.integrals.shape[2] // 8))
     through = np.exp(-sample.integrals[..., : sample.integrals.shape[2] // wide * wide])
     least = photons * float(np.quantile(through.reshape(*through.shape[:2], -1, wide).mean(-1), 0.005))
-    verdict = verdict_below(least, look=PHOTONS_LOOK, bad=PHOTONS_BAD)
     return finding(
         "counts",
-        verdict,
+        verdict_below(least, look=PHOTONS_LOOK, bad=PHOTONS_BAD),
         f"{photons:.3g} photons per pixel in the open beam, {least:.3g} behind the thickest part",
         least,
         f"look below {PHOTONS_LOOK:g} photons, bad below {PHOTONS_BAD:g}",
@@ -208,10 +204,9 @@ def unusable(sample: Sample) -> Finding:
     usable = sample.scan.usable
     fraction = 0.0 if usable is None else 1 - float(usable.mean())
     views = 0 if usable is None or len(usable) == 1 else int((~usable.any(axis=(1, 2))).sum())
-    verdict = verdict_above(fraction, look=UNUSABLE_LOOK, bad=UNUSABLE_BAD)
     return finding(
         "dead pixels",
-        verdict,
+        verdict_above(fraction, look=UNUSABLE_LOOK, bad=UNUSABLE_BAD),
         f"{100 * fraction:.2g} % of the values are left out" + (f", {several(views, 'whole view')}" if views else ""),
         fraction,
         f"look from {100 * UNUSABLE_LOOK:g} %, bad from {100 * UNUSABLE_BAD:g} %",
@@ -227,14 +222,11 @@ def truncation(sample: Sample) -> Finding:
     """Measure the fraction of views in which the object reaches the border of the detector."""
     reached = np.asarray(sample.border > sample.air_level)
     fraction = float(reached.any(axis=(1, 2)).mean())
-    sides = reached[..., 0].any(), reached[..., 1].any()
-    which = {(True, False): " on the left", (False, True): " on the right", (True, True): " on both sides"}.get(
-        (bool(sides[0]), bool(sides[1])), ""
-    )
-    verdict = verdict_above(fraction, look=TRUNCATED_LOOK, bad=TRUNCATED_BAD)
+    left, right = reached[..., 0].any(), reached[..., 1].any()
+    which = " on both sides" if left and right else " on the left" if left else " on the right" if right else ""
     return finding(
         "truncation",
-        verdict,
+        verdict_above(fraction, look=TRUNCATED_LOOK, bad=TRUNCATED_BAD),
         f"the object reaches the border{which} in {100 * fraction:.3g} % of the views",
         fraction,
         f"look from {100 * TRUNCATED_LOOK:g} %, bad from {100 * TRUNCATED_BAD:g} %; line integrals above "
@@ -331,10 +323,9 @@ def beam_hardening(sample: Sample) -> Finding | str:
     if explained < ONE_MATERIAL:
         return f"path lengths explain {100 * explained:.0f} % of the line integrals: the object is not of one material"
     number = float(-bent / straight) if straight > 0 else 0.0
-    verdict = BAD if number >= HARDENING_BAD else LOOK if number >= HARDENING_LOOK else GOOD
     return finding(
         "beam hardening",
-        verdict,
+        verdict_above(number, look=HARDENING_LOOK, bad=HARDENING_BAD),
         f"the line integral of the longest path is {100 * number:.3g} % below the trend of short paths "
         f"(path length explains {100 * explained:.4g} % of the variance)",
         number,

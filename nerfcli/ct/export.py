@@ -87,17 +87,11 @@ def export_scan(
 
 
 def write_volume(path: Path, volume: VolumeFile) -> None:
-    """Write a volume in the format of the path's suffix: .nrrd, .mha, .nii or .tif; atomic.
-
-    Args:
-        volume: float32 or uint8.
+    """Write a volume, of float32 or uint8, in the format of the path's suffix: .nrrd, .mha, .nii or .tif; atomic.
 
     Raises:
         UserError: the suffix is none of these, or the file cannot be written.
-        ValueError: the values have another type.
     """
-    if volume.values.dtype not in _TYPES:
-        raise ValueError(f"volumes are float32 or uint8, not {volume.values.dtype}")
     if path.suffix.lower() not in _WRITERS:
         raise UserError(f"{path.name}: unknown volume format", f"choose one of {', '.join(VOLUMES)}")
     with atomic_path(path) as partial:
@@ -191,7 +185,7 @@ def _write_tiff(path: Path, volume: VolumeFile) -> None:
 
 
 def _units(volume: VolumeFile) -> str:
-    return f"unit {volume.unit or '-'} quantity {volume.quantity or '-'}"
+    return f"unit {volume.unit} quantity {volume.quantity}"
 
 
 _WRITERS: dict[str, Callable[[Path, VolumeFile], None]] = {

@@ -97,9 +97,7 @@ def _extended(camera: Camera, s: np.ndarray) -> np.ndarray:
 
     The model also counts as ended where the pixel is far beyond the picture, so that splines stay well behaved.
     """
-    inside, outside = np.zeros(len(s)), np.ones(len(s))
-    known = _is_known(camera, s)
-    outside[known], inside[known] = 1.0, 1.0
+    inside, outside = _is_known(camera, s).astype(np.float64), np.ones(len(s))
     for _ in range(30):
         middle = (inside + outside) / 2
         good = _is_known(camera, s * middle[:, None])

@@ -87,16 +87,14 @@ def _parallel(
     circle = Circle("parallel", tuple(angles.tolist()), width, height, data.shape[1], data.shape[2])
     if sides is None:
         notes.append("the file does not state the pixel size: lengths are in pixels")
-    beam = None
-    if flats is None:
+    beam = None if flats is None else open_beam_of(flats, darks, projections=data.shape, path=path)
+    if beam is None:
         if float(np.nanquantile(data, 0.999)) > 1.5:
             raise UserError(
                 f"{path} has no flats: the open beam is unknown",
                 "add them (data_white, or image_key 1), or store transmissions instead of detector values",
             )
         notes.append("there are no flats: values are taken as transmissions")
-    else:
-        beam = open_beam_of(flats, darks, projections=data.shape, path=path)
     kind = "transmission" if beam is None else "counts"
     unit = "voxel" if sides is None else "mm"
     return ReaderOutput(path, form, data, kind, circle, unit, beam=beam, notes=notes, mm=mm)
