@@ -41,13 +41,9 @@ class PageField:
         hidden, encoded = self.field["width"], 4 * len(self.field["resolutions"])
         layers, at = [], 0
         for outputs, inputs in ((hidden, encoded), (16, hidden), (hidden, 32), (hidden, hidden), (4, hidden)):
-            layer = np.zeros((outputs, inputs), F)
-            for j in range(outputs // 4):
-                for i in range(inputs // 4):
-                    block = numbers[at : at + 16].reshape(4, 4)
-                    layer[4 * j : 4 * j + 4, 4 * i : 4 * i + 4] = block.T
-                    at += 16
-            layers.append(layer)
+            blocks = numbers[at : at + outputs * inputs].reshape(outputs // 4, inputs // 4, 4, 4)
+            layers.append(blocks.transpose(0, 3, 1, 2).reshape(outputs, inputs))
+            at += outputs * inputs
         assert at == len(numbers)
         return layers
 

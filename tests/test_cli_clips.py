@@ -103,17 +103,3 @@ def test_frames_and_scene_are_kept(clip, estimated):
     assert "my clip-frames contains other frames" in nerfcli("poses", clip, "--frames", "5").stderr
     assert nerfcli("poses", clip, "--frames", "5", "--overwrite").exit_code == 0
     assert [count for _, _, count in estimated] == [6, 6, 5]
-
-
-def test_masks_go_to_the_settings(tmp_path, monkeypatch):
-    calls: list[Any] = []
-
-    def estimate(folder: Path, scene: Path, *, settings: Any, **more: Any) -> Any:
-        calls.append(settings)
-        return estimated_poses()
-
-    monkeypatch.setattr(structure_from_motion, "estimate_poses", estimate)
-    monkeypatch.chdir(tmp_path)
-    Path("photos").mkdir()
-    assert nerfcli("poses", "photos", "--masks", "masks").exit_code == 0
-    assert [settings.masks for settings in calls] == [str(tmp_path.resolve() / "masks")]

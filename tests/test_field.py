@@ -190,12 +190,6 @@ def test_checkpoint_that_is_missing_cut_short_or_foreign(tmp_path):
         assert caught.value.exit_code == BAD_INPUT
 
 
-def test_checkpoint_under_a_file_cannot_be_written(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match=r"cannot write .*a\.safetensors"):
-        save_tensors(tmp_path / "file" / "a.safetensors", {"a": torch.zeros(1)}, {})
-
-
 def some_model() -> Model:
     torch.manual_seed(3)
     rotation = rotation_from_quaternion(np.array([0.9, 0.1, -0.3, 0.2]))

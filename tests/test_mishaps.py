@@ -18,7 +18,6 @@ from full_disk import files_of_at_most
 
 from nerfcli import atomic, kernels
 from nerfcli.atomic import exclusive
-from nerfcli.captures.loading import load_scene
 from nerfcli.errors import BAD_INPUT, INTERRUPTED, OUT_OF_MEMORY, TERMINATED
 from nerfcli.interrupts import Terminated, install_handlers
 from nerfcli.training.runs.files import LOCK, PHOTO_DEPTHS
@@ -161,13 +160,6 @@ def test_what_a_killed_evaluation_left_goes_with_the_next(finished):
     (left / "half.png").write_bytes(b"half")
     assert nerfcli("evaluate", finished, "--threads", "2").exit_code == 0
     assert not left.exists()
-
-
-def test_a_scene_is_read_while_it_is_trained_on(capture):
-    """Commands do not lock a scene, as they only read it."""
-    with exclusive(capture.with_name("new") / LOCK, "nerfcli train is working"):
-        assert len(load_scene(capture).frames) == 5
-        assert nerfcli("info", capture).exit_code == 0
 
 
 def test_ctrl_c_while_the_program_is_imported_ends_in_one_line():

@@ -53,18 +53,21 @@ def test_the_plan_can_be_read_and_names_the_files_that_are_skipped(tmp_path: Pat
 
 
 @pytest.mark.parametrize("command", ["poses", "run"])
-def test_the_quality_goes_to_the_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str):
-    calls: list[tuple[int, int | None]] = []
+def test_options_go_to_the_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str):
+    given: list[PoseSettings] = []
 
     def estimate(folder: Path, scene: Path, *, settings: PoseSettings, **more: object) -> None:
-        calls.append((settings.max_image_size, settings.max_features))
+        given.append(settings)
         raise UserError("enough", "that was all")
 
     monkeypatch.setattr(structure_from_motion, "estimate_poses", estimate)
     photos = write_photos(tmp_path / "photos", 5)
     for quality in ("fast", "best"):
         assert nerfcli(command, photos, "--quality", quality).exit_code == BAD_INPUT
-    assert calls == [QUALITIES["fast"], QUALITIES["best"]]
+    assert [(each.max_image_size, each.max_features) for each in given] == [QUALITIES["fast"], QUALITIES["best"]]
+    if command == "poses":
+        assert nerfcli(command, photos, "--masks", "masks").exit_code == BAD_INPUT
+        assert given[-1].masks == str(Path("masks").resolve())
     assert nerfcli(command, photos, "--quality", "superb").exit_code == USAGE
 
 
