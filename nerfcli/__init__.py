@@ -10,7 +10,7 @@ imported on first use: `import nerfcli` is fast.
 # the first compression (a PNG, a TIFF, an npz) aborts the process.
 import zlib  # noqa: F401
 
-from nerfcli.version import __version__ as __version__
+__version__ = "0.1.0"
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ FOLDERS = sorted(path.parent for path in ROOT.glob("*/__init__.py"))
 # The part on the left may import those on the right, which all stand above it.
 ROOTS = {
     *("errors", "atomic", "interrupts", "child", "distributed", "machine", "notices"),
-    *("output", "ply", "version", "__init__"),
+    *("output", "ply", "__init__"),
 }
 MAY_IMPORT: dict[str, set[str]] = {
     **{root: set() for root in ROOTS},

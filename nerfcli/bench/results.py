@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from nerfcli import __version__
 from nerfcli.atomic import atomic_path, write_json
 from nerfcli.pages import figures
-from nerfcli.version import __version__
 
 BENCH = "bench.json"
 COLUMNS = ("setting", "seconds", "quartiles", "repeats", "peak MB", "PSNR dB", "levels off", "steps", "fastest")

@@ -7,6 +7,7 @@ from io import TextIOWrapper
 
 import typer
 
+from nerfcli import __version__
 from nerfcli.cli import (
     ablate,
     bench,
@@ -28,7 +29,6 @@ from nerfcli.cli.usage import PhotoCommand, Program
 from nerfcli.errors import INTERRUPTED, TERMINATED
 from nerfcli.interrupts import install_handlers
 from nerfcli.machine import keep_freed_memory
-from nerfcli.version import __version__
 
 app = typer.Typer(
     cls=Program,

@@ -172,14 +172,14 @@ def refuse_unused(unused: dict[str, tuple[bool, str]], words: str) -> None:
             raise typer.BadParameter(words.format(suited), param_hint=option)
 
 
-def seconds_from_text(text: str, option: str = "--budget") -> float:
-    """Parse 90s, 5m, 1.5h or plain seconds, the value of an option."""
+def seconds_from_text(text: str) -> float:
+    """Parse 90s, 5m, 1.5h or plain seconds, the value of --budget."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smh]?)", text.strip())
     seconds = float(match[1]) * _SECONDS_PER_UNIT[match[2] or "s"] if match else 0.0
     if not seconds > 0:
-        raise typer.BadParameter(f"{text!r} is not a time; write 90s, 5m or 1h", param_hint=option)
+        raise typer.BadParameter(f"{text!r} is not a time; write 90s, 5m or 1h", param_hint="--budget")
     if match and not match[2] and seconds < FEWEST_PLAIN_SECONDS:
-        raise typer.BadParameter(f"{text!r} has no unit; write {match[1]}s or {match[1]}m", param_hint=option)
+        raise typer.BadParameter(f"{text!r} has no unit; write {match[1]}s or {match[1]}m", param_hint="--budget")
     return seconds
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from nerfcli import __version__
 from nerfcli.atomic import clear_leftovers, exclusive
 from nerfcli.ct.calibrate import air_factors, beside_object, detector_tilt, found_noise
 from nerfcli.ct.centre import FEWEST_VIEWS, centre_of, highest_contrast_row
@@ -36,7 +37,6 @@ from nerfcli.interrupts import deferred_interrupts
 from nerfcli.machine import default_memory_limit, thread_count, use_threads
 from nerfcli.notices import Progress, Reporter
 from nerfcli.output import Output
-from nerfcli.version import __version__
 
 # Largest fraction of the time budget for estimates before the fit, and of the time left for the coarse start.
 CHOICE_FRACTION, COARSE_FRACTION = 0.25, 0.1

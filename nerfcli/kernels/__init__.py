@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from nerfcli import __version__
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.kernels.composition import Backend
 from nerfcli.kernels.contraction import CONTRACTIONS, contract, grid_coordinates
@@ -34,7 +35,6 @@ from nerfcli.kernels.interface import (
     TraceOptions,
 )
 from nerfcli.kernels.reference import distances_to_occupied, ray_indices, sum_along_rays
-from nerfcli.version import __version__
 
 
 def backend_for(device: torch.device, dtype: torch.dtype) -> Backend:

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from nerfcli import __version__
 from nerfcli.atomic import cannot_write, clear_leftovers, exclusive, replace_folder, write_json
 from nerfcli.errors import UserError, in_shell
 from nerfcli.field.background import Background, SphereBackground
@@ -45,7 +46,6 @@ from nerfcli.render.job import BLACK, RenderJob, RenderSettings, depth_meta, wit
 from nerfcli.render.pictures import Renderable, RenderedPicture, straight_rgba
 from nerfcli.render.presentation import write_previews, write_videos
 from nerfcli.render.tracing import TOLERANCE
-from nerfcli.version import __version__
 
 # Some steps of a picture use one thread, so several are in progress; more would wait for Python's lock.
 MOST_AT_A_TIME = 4

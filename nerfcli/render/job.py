@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from nerfcli import __version__
 from nerfcli.atomic import read_json, write_json
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
@@ -22,7 +23,6 @@ from nerfcli.render.files.depth_meta import CONVENTION_OF, QUANTITIES, DepthMeta
 from nerfcli.render.files.file_facts import RENDERS
 from nerfcli.render.files.film import ENCODERS, check_encoders
 from nerfcli.render.pictures import Renderable
-from nerfcli.version import __version__
 
 OUTPUTS = ("rgb", "depth", "opacity", *CONVENTION_OF)
 # Measured outputs, which are stored as floats, with previews in false colours.

@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
+from nerfcli import __version__
 from nerfcli.photos.colours import levels_of
 from nerfcli.photos.images import read_image, write_png
 from nerfcli.render.files.depth_files import quantiles, read_map
 from nerfcli.render.files.depth_meta import AXES, KEY, UNIT_OF, DepthMeta
 from nerfcli.render.files.film import write_video
 from nerfcli.render.job import MEASURED, RenderJob, meaning_of
-from nerfcli.version import __version__
 
 COLOURS = "turbo"
 DISTANCES = ("depth", "lower", "upper")

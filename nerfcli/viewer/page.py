@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from nerfcli import __version__
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import up_direction
 from nerfcli.errors import in_shell
@@ -15,7 +16,6 @@ from nerfcli.pages import page
 from nerfcli.photos.colours import levels_of
 from nerfcli.render.model import Model
 from nerfcli.render.tracing import TOLERANCE
-from nerfcli.version import __version__
 from nerfcli.viewer.packing import PackedField
 from nerfcli.viewer.pictures import Proof, frustum_depth, view_of
 

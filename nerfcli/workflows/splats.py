@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from nerfcli import __version__
 from nerfcli.cameras.frame import chosen_evenly
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import Similarity, look_at
@@ -36,7 +37,6 @@ from nerfcli.splats.render import SplatScene, near_of
 from nerfcli.splats.start import count_for, gaussians_of_field
 from nerfcli.training.runs.files import SPLATS
 from nerfcli.training.runs.run import Run
-from nerfcli.version import __version__
 
 FORMAT = "nerfcli splat file 1"
 # Photos of the training that the field and the splats are compared on.

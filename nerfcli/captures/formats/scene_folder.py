@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from nerfcli import __version__
 from nerfcli.atomic import write_json
 from nerfcli.cameras.frame import SensorDepth
 from nerfcli.captures.capture import Capture
@@ -24,7 +25,6 @@ from nerfcli.captures.holdout import default_split
 from nerfcli.captures.orientation import UPRIGHT
 from nerfcli.errors import UserError, in_shell
 from nerfcli.photos.masks import find_mask
-from nerfcli.version import __version__
 
 SCENE_FILE = "scene.json"
 MODEL_FOLDER = "sparse/0"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from nerfcli import __version__
 from nerfcli.atomic import digest
 from nerfcli.cameras.frame import Frame
 from nerfcli.evaluate.report.run_facts import RunFacts, captures_of, mismatches_of, scenes_of, warnings_of
@@ -39,7 +40,6 @@ from nerfcli.photos.images import reduced
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.files.depth_meta import DepthMeta
 from nerfcli.render.presentation import ColourRange, coloured
-from nerfcli.version import __version__
 
 DEPTH_COLOURS = "turbo"
 _MEGA = 1e6

@@ -12,8 +12,8 @@ from typing import Any, Self
 
 import numpy as np
 
+from nerfcli import __version__
 from nerfcli.errors import UserError
-from nerfcli.version import __version__
 
 FORMAT = "nerfcli depth 2"
 # The key of a description in PNG text chunks and OpenEXR attributes.

@@ -23,11 +23,11 @@ import tifffile
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
+from nerfcli import __version__
 from nerfcli.atomic import atomic_path, write_json
 from nerfcli.errors import UserError
 from nerfcli.photos.colours import linear_light
 from nerfcli.render.files.depth_meta import CONVENTION_OF, KEY, DepthMeta, check_map
-from nerfcli.version import __version__
 
 
 def write_npy(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from nerfcli import __version__
 from nerfcli.atomic import read_json, read_sealed, write_sealed
 from nerfcli.cameras.frame import Frame
 from nerfcli.captures.capture import Capture
@@ -35,7 +36,6 @@ from nerfcli.training.runs.files import (
     read_log,
 )
 from nerfcli.training.runs.settings import TrainSettings
-from nerfcli.version import __version__
 
 
 @dataclass(frozen=True)
