@@ -45,7 +45,7 @@ from nerfcli.viewer import painter
 from nerfcli.viewer.packing import PackedField, pack_model
 from nerfcli.viewer.painter import Painter, Tile, View, render_tile, strides_of, tiles_of, view_from_json
 from nerfcli.viewer.pictures import view_of
-from nerfcli.viewer.server import Address, PageServer
+from nerfcli.viewer.server import PageServer
 from nerfcli.workflows.view import RunData, view_run
 
 SHORT = replace(FEW, downscale=8, model="default")
@@ -56,22 +56,18 @@ class Served:
 
     def __init__(self, run: Path):
         self.show = RunData(run, Resources(2))
-        self.server = PageServer(self.show, Address(port=0))
+        self.server = PageServer(self.show, port=0)
         self.url = self.server.url("127.0.0.1")
         threading.Thread(target=self.server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
 
-    def get(self, place: str = "", body: Any = None) -> bytes:
+    def get(self, place: str = "", body: Any = None, *, url: str | None = None) -> bytes:
         data = None if body is None else json.dumps(body).encode()
-        with urllib.request.urlopen(urllib.request.Request(self.url + place, data), timeout=60) as answer:
+        with urllib.request.urlopen(urllib.request.Request((url or self.url) + place, data), timeout=60) as answer:
             return answer.read()
 
     def refusal(self, place: str, body: Any = None, *, url: str | None = None) -> tuple[int, str]:
-        self.url, before = url or self.url, self.url
-        try:
-            with pytest.raises(urllib.error.HTTPError) as caught:
-                self.get(place, body)
-        finally:
-            self.url = before
+        with pytest.raises(urllib.error.HTTPError) as caught:
+            self.get(place, body, url=url)
         with caught.value as answer:
             return answer.code, answer.read().decode()
 
@@ -337,7 +333,7 @@ def test_a_port_in_use_is_reported_or_skipped(finished):
         assert error == f"Error: port {port} of 127.0.0.1 is in use"
         assert "--port" in hint
     show = RunData(finished, Resources(1))
-    with PageServer(show, Address()) as one, PageServer(show, Address()) as two:
+    with PageServer(show) as one, PageServer(show) as two:
         assert one.port < two.port
 
 
@@ -365,7 +361,7 @@ def test_the_ssh_command_leads_to_the_printed_address_without_a_user_name_too(fi
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        view_run(finished, Address(host), on_ready=on_ready)
+        view_run(finished, host=host, on_ready=on_ready)
     assert printed[0].startswith(f"http://{reached}:8123/")
     assert shlex.split(printed[1]) == ["ssh", "-L", f"8123:{reached}:8123", socket.gethostname()]
 

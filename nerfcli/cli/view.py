@@ -39,7 +39,6 @@ def view(
       nerfcli view photos-scene-run
       nerfcli view photos-scene-run --port 9000 --no-browser
     """
-    from nerfcli.viewer.server import Address
     from nerfcli.workflows.view import open_browser, view_run
 
     console = Console(quiet=False, json_lines=False)
@@ -52,4 +51,4 @@ def view(
         if browser:
             open_browser(url)
 
-    view_run(run, Address(host, port), resources=Resources(threads), on_ready=on_ready)
+    view_run(run, host=host, port=port, resources=Resources(threads), on_ready=on_ready)

@@ -6,7 +6,6 @@ import secrets
 import socket
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from errno import EACCES, EADDRINUSE
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -47,16 +46,8 @@ class PageData(Protocol):
 LOCAL = "127.0.0.1"
 
 
-@dataclass(frozen=True)
-class Address:
-    """Where the server listens; by default only this machine reaches it, at the first free port from `FIRST_PORT`."""
-
-    host: str = LOCAL
-    port: int | None = None
-
-
 class PageServer(ThreadingHTTPServer):
-    """Serves a show.
+    """Serves a show; by default only to this machine, at the first free port from `FIRST_PORT`.
 
     Raises:
         UserError: the port is taken, or the address does not exist.
@@ -66,8 +57,7 @@ class PageServer(ThreadingHTTPServer):
     # On Windows this option would let a second server take the port of the first.
     allow_reuse_address = sys.platform != "win32"
 
-    def __init__(self, show: PageData, address: Address):
-        host, port = address.host, address.port
+    def __init__(self, show: PageData, host: str = LOCAL, *, port: int | None = None):
         self.show = show
         self.token = secrets.token_urlsafe(16)
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET

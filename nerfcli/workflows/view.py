@@ -27,13 +27,14 @@ from nerfcli.viewer.packing import pack_model
 from nerfcli.viewer.page import live_page_html, scene_of
 from nerfcli.viewer.painter import Painter, view_from_json
 from nerfcli.viewer.pictures import fetched_photos, make_proof, photo_jpeg
-from nerfcli.viewer.server import LOCAL, Address, PageServer
+from nerfcli.viewer.server import LOCAL, PageServer
 
 
 def view_run(
     run: str | Path,
-    address: Address = Address(),
     *,
+    host: str = LOCAL,
+    port: int | None = None,
     resources: Resources = Resources(),
     on_ready: Callable[[str, str], None],
 ) -> None:
@@ -41,7 +42,7 @@ def view_run(
 
     Args:
         run: the folder that `train_scene` wrote, or is writing.
-        address: where to listen.
+        host, port: where to listen; see `PageServer`.
         resources: threads for pictures.
         on_ready: called with the page's address and the command that makes it work on another machine ("" for none).
 
@@ -52,10 +53,10 @@ def view_run(
     path = Path(run)
     if not (path / CONFIG).exists():
         raise no_run(path)
-    host = {"0.0.0.0": LOCAL, "::": "::1"}.get(address.host, address.host)
-    with PageServer(RunData(path, resources), address) as server:
-        local = host in (LOCAL, "::1", "localhost")
-        on_ready(server.url(host), _from_elsewhere(host, server.port) if local else "")
+    reached = {"0.0.0.0": LOCAL, "::": "::1"}.get(host, host)
+    with PageServer(RunData(path, resources), host, port=port) as server:
+        local = reached in (LOCAL, "::1", "localhost")
+        on_ready(server.url(reached), _from_elsewhere(reached, server.port) if local else "")
         server.serve_forever()
 
 
