@@ -34,9 +34,9 @@ class Written:
     values: np.ndarray
 
 
-def numbers(views: int = VIEWS, rows: int = ROWS, columns: int = COLUMNS) -> np.ndarray:
+def numbers(rows: int = ROWS) -> np.ndarray:
     """Return transmissions between 0.2 and 0.9, all different."""
-    return np.random.default_rng(0).uniform(0.2, 0.9, (views, rows, columns)).astype(np.float32)
+    return np.random.default_rng(0).uniform(0.2, 0.9, (VIEWS, rows, COLUMNS)).astype(np.float32)
 
 
 def turned(angle: float, point: np.ndarray) -> np.ndarray:

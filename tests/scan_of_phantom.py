@@ -9,38 +9,21 @@ from nerfcli.ct.geometry import Beam, Circle
 from nerfcli.ct.scan import Scan, held_out_views
 
 
-def phantom_circle(
-    *,
-    beam: Beam = "cone",
-    views: int = 24,
-    first_deg: float = 0.0,
-    span_deg: float = 360.0,
-    columns: int = 40,
-    rows: int = 1,
-    column_shift: float = 0.0,
-) -> Circle:
+def phantom_circle(*, beam: Beam = "cone", views: int = 24, span_deg: float = 360.0, columns: int = 40) -> Circle:
     """Return a circle around the phantom of `bean`, about 20 wide, with a fan of 40 degrees for a cone beam."""
-    angles = np.radians(first_deg + span_deg / views * np.arange(views))
-    width = 24 / columns
-    magnified = 2.0 if beam == "cone" else 1.0
-    side = width * magnified
+    angles = np.radians(span_deg / views * np.arange(views))
+    side = 24 / columns * (2.0 if beam == "cone" else 1.0)
     return Circle(
         beam,
         tuple(angles.tolist()),
-        *(side, side, rows, columns),
+        *(side, side, 1, columns),
         source_origin=34.0 if beam == "cone" else 0.0,
         source_detector=68.0 if beam == "cone" else 0.0,
-        column_shift=column_shift,
     )
 
 
 def scan_of_phantom(
-    circle: Circle,
-    *,
-    stated: Circle | None = None,
-    photons: float | None = None,
-    phantom: Sequence[Ellipsoid] = (),
-    seed: int = 0,
+    circle: Circle, *, stated: Circle | None = None, photons: float | None = None, phantom: Sequence[Ellipsoid] = ()
 ) -> Scan:
     """Return a scan of the phantom: line integrals, or transmissions with counting noise if `photons` is given.
 
@@ -49,13 +32,12 @@ def scan_of_phantom(
         stated: the geometry that the scan states; None for the true one.
         photons: mean count of an unobstructed pixel.
         phantom: instead of `bean`.
-        seed: of the noise.
     """
     integrals = line_integrals(phantom or bean(), *circle.geometry().rays())
     held_out = held_out_views(len(circle.angles))
     geometry = (stated or circle).geometry()
     if photons is None:
         return Scan(geometry, "line_integral", integrals.astype(np.float32), held_out=held_out)
-    counts = np.random.default_rng(seed).poisson(photons * np.exp(-integrals))
+    counts = np.random.default_rng(0).poisson(photons * np.exp(-integrals))
     values = (counts / photons).astype(np.float32)
     return Scan(geometry, "transmission", values, photons_per_value=photons, held_out=held_out)

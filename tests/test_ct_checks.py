@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,10 +23,10 @@ VIEWS, COLUMNS = 96, 48
 SOLID = (Ellipsoid((0.5, -0.3, 0), (8, 6, 7), 0.3, turn=0.4),)
 
 
-def scan(**changes: object) -> Scan:
+def scan(photons: float | None = 3e4, phantom: Sequence[Ellipsoid] = SOLID, **changes: object) -> Scan:
     """A fan beam of a solid with 30,000 photons."""
     circle = phantom_circle(views=VIEWS, columns=COLUMNS, **changes)  # type: ignore[arg-type]
-    return scan_of_phantom(circle, photons=3e4, phantom=SOLID)
+    return scan_of_phantom(circle, photons=photons, phantom=phantom)
 
 
 def checked(name: str, of: Scan) -> Finding | str:
@@ -69,8 +69,7 @@ def test_constant_columns_are_rings() -> None:
         values[:, :, [20, 41]] *= 0.95
         return values
 
-    clear = scan_of_phantom(phantom_circle(views=VIEWS, columns=COLUMNS), photons=1e6, phantom=SOLID)
-    found = finding("rings", changed(clear, wrong))
+    found = finding("rings", changed(scan(photons=1e6), wrong))
     assert found.verdict != "good"
     # A wrong column also changes the values with which its neighbours are compared.
     assert 2 / 60 <= (found.number or 0) <= 6 / 60
@@ -78,7 +77,7 @@ def test_constant_columns_are_rings() -> None:
 
 def test_few_photons() -> None:
     """Closed form: through a line integral of 2 * 8 * 0.3 = 4.8, 100 photons leave 0.8, and 500 leave 4."""
-    low = scan_of_phantom(phantom_circle(views=VIEWS, columns=COLUMNS), photons=500, phantom=SOLID)
+    low = scan(photons=500)
     found = finding("counts", low)
     assert found.verdict == "bad"
     assert 1 < (found.number or 0) < 6
@@ -86,10 +85,7 @@ def test_few_photons() -> None:
 
 
 def test_an_object_wider_than_the_detector() -> None:
-    wide = scan_of_phantom(
-        phantom_circle(views=VIEWS, columns=COLUMNS), phantom=(Ellipsoid((6, 0, 0), (9, 5, 5), 0.3),)
-    )
-    found = finding("truncation", wide)
+    found = finding("truncation", scan(None, [Ellipsoid((6, 0, 0), (9, 5, 5), 0.3)]))
     assert found.verdict == "bad"
     assert "on both sides" in found.summary
     assert "no column sees" not in str(found)
@@ -108,8 +104,7 @@ def test_an_object_wider_than_the_detector() -> None:
 )
 def test_the_missing_wedge_is_named(beam: Beam, span: float, missing: float, verdict: str) -> None:
     """Closed form, within two steps between views."""
-    circle = phantom_circle(beam=beam, views=VIEWS, columns=COLUMNS, span_deg=span)
-    found = finding("missing wedge", scan_of_phantom(circle))
+    found = finding("missing wedge", scan(None, (), beam=beam, span_deg=span))
     assert found.verdict == verdict
     assert found.number == pytest.approx(missing, abs=2 * span / VIEWS)
     assert ("is missing" in found.summary) == (missing > 0)
@@ -119,7 +114,7 @@ def test_empty_projections_are_no_air_and_no_views() -> None:
     """Regression: line integrals of 0 in place of 60 of 96 views hid the missing wedge and a bad column."""
     usable = np.ones((VIEWS, 1, 1), bool)
     usable[36:] = False
-    cut = replace(scan_of_phantom(phantom_circle(views=VIEWS, columns=COLUMNS), phantom=SOLID), usable=usable)
+    cut = replace(scan(None), usable=usable)
     half = replace(scan(span_deg=180, beam="parallel"), usable=usable)
     assert finding("open beam", half).verdict == "good"
     wedge = finding("missing wedge", half)
@@ -168,16 +163,13 @@ def test_a_centre_off_the_middle(beam: Beam, shift: float) -> None:
 @pytest.mark.parametrize(("bend", "verdict"), [(0.0, "good"), (0.10, "look"), (0.30, "bad")])
 def test_beam_hardening_is_named(bend: float, verdict: str) -> None:
     """Line integrals minus a quadratic term, which takes a known fraction of the longest one, 16 * 0.3 = 4.8."""
-    circle = phantom_circle(views=VIEWS, columns=COLUMNS)
-    hard = scan_of_phantom(circle, phantom=SOLID)
-    found = finding("beam hardening", changed(hard, lambda p: p * (1 - bend * p / 4.8)))
+    found = finding("beam hardening", changed(scan(None), lambda p: p * (1 - bend * p / 4.8)))
     assert found.verdict == verdict
     assert found.number == pytest.approx(bend, abs=0.04)
 
 
 def test_hardening_is_not_distinguished_from_two_materials() -> None:
-    two = (*SOLID, Ellipsoid((2, 1, 0), (2, 2, 2), 3.0))
-    answer = checked("beam hardening", scan_of_phantom(phantom_circle(views=VIEWS, columns=COLUMNS), phantom=two))
+    answer = checked("beam hardening", scan(None, [*SOLID, Ellipsoid((2, 1, 0), (2, 2, 2), 3.0)]))
     assert "not of one material" in str(answer)
 
 

@@ -14,8 +14,8 @@ from nerfcli.splats.gaussians import Gaussians, basis
 RELATIVE = 5e-6
 
 
-def some_gaussians(seed: int, degree: int, count: int = 20) -> Gaussians:
-    rng = np.random.default_rng(seed)
+def some_gaussians(seed: int, degree: int) -> Gaussians:
+    rng, count = np.random.default_rng(seed), 20
     means, log_scales = rng.normal(size=(count, 3)), rng.normal(size=(count, 3)) - 2
     quaternions, logits = rng.normal(size=(count, 4)), rng.normal(size=count)
     return Gaussians(means, log_scales, quaternions, logits, rng.normal(size=(count, (degree + 1) ** 2, 3)))
@@ -26,8 +26,8 @@ def some_similarity(seed: int) -> Similarity:
     return Similarity(float(np.exp(rng.normal())), Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3))
 
 
-def directions(count: int = 30) -> np.ndarray:
-    drawn = np.random.default_rng(9).normal(size=(count, 3))
+def directions() -> np.ndarray:
+    drawn = np.random.default_rng(9).normal(size=(30, 3))
     return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
 
 

@@ -96,12 +96,12 @@ def left_halves(photos: Sequence[LoadedPhoto], *_: object, threads: int) -> list
     return [np.broadcast_to(np.arange(width) < width // 2, (height, width)) for height, width in shapes]
 
 
-def of_rank(rank: int, port: int, count: int = 2) -> dict[str, str]:
+def of_rank(rank: int, port: int) -> dict[str, str]:
     """The environment that torchrun gives to a process."""
     return {
         **os.environ,
         **dict.fromkeys(("RANK", "LOCAL_RANK"), str(rank)),
-        **dict.fromkeys(("WORLD_SIZE", "LOCAL_WORLD_SIZE"), str(count)),
+        **dict.fromkeys(("WORLD_SIZE", "LOCAL_WORLD_SIZE"), "2"),
         "MASTER_ADDR": "127.0.0.1",
         "MASTER_PORT": str(port),
         "TORCHELASTIC_RUN_ID": "test",

@@ -36,16 +36,12 @@ from nerfcli.errors import UserError
 PHOTONS = 2e4
 
 
-def cone(
-    views: int = 30, *, rows: int = 24, columns: int = 40, pixel: float = 0.9, turn: float = 2 * np.pi
-) -> ScanGeometry:
-    sizes = {"pixel_width": pixel, "pixel_height": pixel, "rows": rows, "columns": columns}
-    return Circle(
-        "cone", tuple(np.arange(views) * turn / views), source_origin=60, source_detector=90, **sizes
-    ).geometry()
+def cone(views: int = 30, *, rows: int = 24, columns: int = 40, pixel: float = 0.9) -> ScanGeometry:
+    angles = tuple(np.arange(views) * 2 * np.pi / views)
+    return Circle("cone", angles, pixel, pixel, rows, columns, source_origin=60, source_detector=90).geometry()
 
 
-def scan_of(geometry: ScanGeometry, *, photons: float = PHOTONS, seed: int = 0, held_out: tuple[int, ...] = ()) -> Scan:
+def scan_of(geometry: ScanGeometry, *, photons: float = PHOTONS, held_out: tuple[int, ...] = ()) -> Scan:
     """Return Poisson counts of the bean, scaled so that `photons` are a value of 1,000; a pixel averages 3 x 3 rays."""
     parts = 3 if geometry.rows > 1 else 1
     fine = replace(
@@ -57,7 +53,7 @@ def scan_of(geometry: ScanGeometry, *, photons: float = PHOTONS, seed: int = 0, 
     )
     passed = np.exp(-line_integrals(bean(), *fine.rays()))
     passed = passed.reshape(geometry.views, geometry.rows, parts, geometry.columns, 3).mean((2, 4))
-    counts = np.random.default_rng(seed).poisson(photons * passed)
+    counts = np.random.default_rng(0).poisson(photons * passed)
     values = (counts * (1000 / photons)).astype(np.float32)
     beam = np.full((1, 1, 1), 1000, dtype=np.float32)
     return Scan(geometry, "counts", values, beam, photons_per_value=photons / 1000, held_out=held_out)

@@ -28,8 +28,8 @@ FISHEYE = Camera("OPENCV_FISHEYE", WIDTH, HEIGHT, (22.0, 22.0, 35.0, 25.0, 0.02,
 CLOSE, CLOSE_GRADIENT = 1e-5, 2e-4
 
 
-def view_of(camera: Camera, *, near: float = 0.0, turned: float = 0.2) -> SplatView:
-    rotation = rotation_from_vector(np.array([0.05, turned, -0.1]))
+def view_of(camera: Camera, *, near: float = 0.0) -> SplatView:
+    rotation = rotation_from_vector(np.array([0.05, 0.2, -0.1]))
     return SplatView(rotation, np.array([-0.5, 0.1, 0.3]), WIDTH, HEIGHT, near, *lens_table(camera))
 
 

@@ -7,10 +7,10 @@ from scipy.ndimage import gaussian_filter
 from nerfcli.splats.refine import SIMILARITY_WEIGHT, loss_gradient
 
 
-def pair(seed: int, shape: tuple[int, int] = (24, 31)) -> tuple[np.ndarray, np.ndarray]:
+def pair(seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a picture and a target with texture, float32; a part of both is black, and a part white."""
     rng = np.random.default_rng(seed)
-    target = gaussian_filter(rng.random((*shape, 3)), (1.2, 1.2, 0.0))
+    target = gaussian_filter(rng.random((24, 31, 3)), (1.2, 1.2, 0.0))
     image = target + 0.1 * rng.normal(size=target.shape)
     image[:6, :9], target[:6, :9] = 0.0, 0.0
     image[-6:, -9:], target[-6:, -9:] = 1.0, 1.0

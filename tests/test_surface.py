@@ -34,23 +34,23 @@ RADIUS, CENTRE = 0.5, np.array([3.0, -2.0, 1.0])
 CAMERA = Camera("PINHOLE", 120, 90, (130.0, 126.0, 58.3, 46.1))
 
 
-def ball_view(place: np.ndarray, *, camera: Camera = CAMERA, name: str = "a.png") -> DepthView:
+def ball_view(place: np.ndarray, *, name: str = "a.png") -> DepthView:
     """Return a camera's view of an opaque ball with nothing behind it, in closed form."""
     pose = look_at(place, CENTRE, np.array([0.1, 0.2, 1.0]))
-    rays = plane_rays(camera) @ pose[:3, :3].T
+    rays = plane_rays(CAMERA) @ pose[:3, :3].T
     off = place - CENTRE
     a, b, c = (rays * rays).sum(-1), (rays * off).sum(-1), off @ off - RADIUS**2
     root = b * b - a * c
     depth = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.nan).astype(np.float32)
     hit = np.isfinite(depth)
     return DepthView(
-        frame=Frame(name, camera, pose),
+        frame=Frame(name, CAMERA, pose),
         rgb=np.full((*depth.shape, 3), 0.5, np.float32),
         opacity=hit.astype(np.float32),
         depth=depth,
         spread=np.where(hit, np.float32(1e-4), np.float32(np.nan)),
         disagreement=np.where(hit, np.float32(0), np.float32(np.nan)),
-        normals=normals_of(depth, camera),
+        normals=normals_of(depth, CAMERA),
     )
 
 
@@ -59,12 +59,12 @@ def around(reach: float, voxel_size: float) -> Grid:
     return Grid.over((*(CENTRE - reach), *(CENTRE + reach)), voxel_size)
 
 
-def places_around(count: int, distance: float = 2.0) -> np.ndarray:
+def places_around(count: int) -> np.ndarray:
     """Places on a sphere around the ball, evenly spread (Fibonacci)."""
     z = 1 - 2 * (np.arange(count) + 0.5) / count
     angle = np.pi * (1 + 5**0.5) * np.arange(count)
     across = np.sqrt(1 - z * z)
-    return CENTRE + distance * np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=-1)
+    return CENTRE + 2.0 * np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=-1)
 
 
 @pytest.fixture(scope="module")
@@ -219,9 +219,9 @@ def test_small_pieces_are_left_out(fused):
 SIMILARITY = Similarity(0.4, rotation_from_vector(np.array([0.3, 0.5, -0.2])), np.array([0.2, -0.1, 0.4]))
 
 
-def block(similarity: Similarity = SIMILARITY, *, unit: str = "metre") -> Model:
+def block(similarity: Similarity = SIMILARITY) -> Model:
     """A dense grey block, [-0.5, 0.5]^3 of the training frame."""
-    model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), similarity, unit=unit, step=1 / 64)
+    model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), similarity, unit="metre", step=1 / 64)
     with torch.no_grad():
         model.field.weights[1][0, 0] = 7.0  # type: ignore[index]
     return model

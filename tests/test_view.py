@@ -94,8 +94,8 @@ def frame_of(run: Path, *, width: int = 90, height: int = 66) -> Frame:
     return replace(frame, camera=Camera.pinhole(width, height, camera.focal_px * width / camera.width))
 
 
-def view_request(frame: Frame, *, client: str = "a") -> dict[str, Any]:
-    return {"client": client, "view": {**view_of(frame), "share": 0.25}}
+def view_request(frame: Frame) -> dict[str, Any]:
+    return {"client": "a", "view": {**view_of(frame), "share": 0.25}}
 
 
 def records(content: bytes) -> Iterator[tuple[Tile, np.ndarray]]:
