@@ -230,22 +230,17 @@ def recent_peak_bytes() -> int | None:
     return None
 
 
-def keep_freed_memory() -> bool:
+def keep_freed_memory() -> None:
     """Keep the memory of freed arrays for later ones, in one heap for all threads, instead of returning it.
 
     A training step allocates what the last one freed. Otherwise the system would clear each page again, for up to 14 ms
-    of CPU time in a step of 62 ms on two threads. Call it before libraries start threads: existing heaps remain.
-
-    Returns:
-        False if the C library is not glibc; then nothing changes.
+    of CPU time in a step of 62 ms on two threads. Call it before libraries start threads: existing heaps remain. If the
+    C library is not glibc, nothing changes.
     """
-    mallopt = _glibc_function("mallopt")
-    if mallopt is None:
-        return False
-    mallopt(_ARENA_MAX, 1)
-    mallopt(_MMAP_THRESHOLD, _RETURNED_ARRAY)
-    mallopt(_TRIM_THRESHOLD, _RETURNED_REST)
-    return True
+    if (mallopt := _glibc_function("mallopt")) is not None:
+        mallopt(_ARENA_MAX, 1)
+        mallopt(_MMAP_THRESHOLD, _RETURNED_ARRAY)
+        mallopt(_TRIM_THRESHOLD, _RETURNED_REST)
 
 
 def return_freed_memory() -> None:

@@ -152,7 +152,7 @@ def _measured(keep: str) -> list[int]:
 def test_freed_memory_is_used_again_without_page_faults_until_it_is_returned():
     if not hasattr(ctypes.CDLL(None), "mallopt"):
         pytest.skip("the C library is not glibc")
-    faults, kept, returned = _measured("assert keep_freed_memory()")
+    faults, kept, returned = _measured("keep_freed_memory()")
     assert faults < 100
     assert returned < kept - 30 * _MEGABYTE
     assert _measured("")[0] > 1000  # without it
@@ -172,5 +172,5 @@ def _no_library(name: None) -> object:
 @pytest.mark.parametrize("load", [lambda name: object(), _no_library], ids=["musl", "windows"])
 def test_another_c_library_is_left_alone(load, monkeypatch):
     monkeypatch.setattr("ctypes.CDLL", load)
-    assert not keep_freed_memory()
+    keep_freed_memory()
     return_freed_memory()
