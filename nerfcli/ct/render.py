@@ -8,7 +8,7 @@ import torch
 
 from nerfcli.atomic import atomic_path
 from nerfcli.ct.evaluate import held_out_air
-from nerfcli.ct.grid import MEANINGS, UNSEEN, VoxelGrid
+from nerfcli.ct.grid import MEANINGS, UNSEEN
 from nerfcli.ct.likelihood import Likelihood, likelihood_of
 from nerfcli.ct.reconstruct import Projector
 from nerfcli.ct.result import Reconstruction, load_reconstruction, scan_of
@@ -100,7 +100,7 @@ def slice_of(result: Reconstruction, axis: str, at: float) -> np.ndarray:
     Raises:
         UserError: the position is outside the volume.
     """
-    grid: VoxelGrid = result.grid
+    grid = result.grid
     positions = grid.axis(axis)
     half = grid.size / 2
     if not positions[0] - half <= at <= positions[-1] + half:
@@ -112,16 +112,13 @@ def slice_of(result: Reconstruction, axis: str, at: float) -> np.ndarray:
     low = min(int(place), max(len(positions) - 2, 0))
     high = min(low + 1, len(positions) - 1)
     number = "zyx".index(axis)
-    layers = [
+    lower, upper = (
         np.where(np.take(result.marks, k, number) & UNSEEN, np.nan, np.take(result.volume, k, number))
         for k in (low, high)
-    ]
-    fraction = place - low
-    return (
-        ((1 - fraction) * layers[0] + fraction * layers[1]).astype(np.float32)
-        if fraction
-        else layers[0].astype(np.float32)
     )
+    fraction = place - low
+    between = (1 - fraction) * lower + fraction * upper if fraction else lower
+    return between.astype(np.float32)
 
 
 def residual_of(likelihood: Likelihood, integrals: torch.Tensor, views: torch.Tensor) -> torch.Tensor:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
@@ -65,7 +64,7 @@ def _picture(model: Model, photo: LoadedPhoto, aside: np.ndarray) -> LoadedPhoto
     pose = photo.frame.world_from_cam.copy()
     pose[:3, 3] += aside
     camera = downscaled_camera(photo.frame.camera, REDUCTION)
-    frame: Frame = replace(photo.frame, camera=camera, world_from_cam=pose)
+    frame = replace(photo.frame, camera=camera, world_from_cam=pose)
     if photo.pixels.shape[-1] == 4:
         seen = render_picture(model, frame, background=(0.0, 0.0, 0.0))
         levels = straight_rgba(seen)
