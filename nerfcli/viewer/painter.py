@@ -9,7 +9,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from queue import SimpleQueue
 from statistics import median
 from typing import Any
@@ -152,86 +153,58 @@ def tiles_of(view: View, stride: int, seconds_per_ray: float) -> list[Tile]:
     return sorted(tiles, key=lambda t: math.hypot(t.x + (t.width - width) / 2, t.y + (t.height - height) / 2))
 
 
-@dataclass
-class _Job:
-    """A requested view of one client: the tiles still to render, and the finished records."""
-
-    client: str
-    view: View
-    records: SimpleQueue[bytes | Exception | None] = field(default_factory=SimpleQueue)
-    opened: tuple[int, Model] | None = None
-    strides: list[int] = field(default_factory=list)
-    tiles: list[Tile] = field(default_factory=list)
-
-
 class Painter:
     """Renders views for clients; a new view of a client replaces its previous one after the current tile."""
 
     def __init__(self, model: Callable[[], tuple[int, Model]], *, threads: int):
         self._model = model
-        self._threads = threads
         self._rates = deque([_FIRST_RATE], maxlen=_RATES)
-        self._newest: dict[str, _Job] = {}
-        self._waiting: list[_Job] = []
-        self._changed = threading.Condition()
-        threading.Thread(target=self._work, daemon=True).start()
+        # The tiles to come of each client's newest view, as records.
+        self._newest: dict[str, Iterator[bytes]] = {}
+        self._lock = threading.Lock()
+        # OpenMP keeps a thread count for each calling thread.
+        self._worker = ThreadPoolExecutor(1, initializer=use_threads, initargs=(threads,))
 
     def paint(self, client: str, view: View) -> Iterator[bytes]:
         """Yield the finished tiles of a view: a header of 8 numbers, then three planes of four values per pixel.
 
         The header is stride, x, y, width, height, width and height of the picture, version of the model.
         """
-        job = _Job(client, view)
-        with self._changed:
-            before = self._newest.get(client)
-            if before is not None:
-                before.records.put(None)
-            self._newest[client] = job
-            self._waiting.append(job)
-            self._changed.notify()
+        tiles, finished = self._tiles(view), SimpleQueue[bytes | Exception | None]()
+
+        def render_one() -> None:
+            """Render the next tile, and queue up for the one after it behind those of other clients."""
+            try:
+                record = next(tiles, None) if self._newest.get(client) is tiles else None
+            except Exception as error:  # raised again in the thread of the client
+                record = error
+            finished.put(record)
+            if isinstance(record, bytes):
+                self._worker.submit(render_one)
+
+        with self._lock:
+            self._newest[client] = tiles
+        self._worker.submit(render_one)
         try:
-            while (record := job.records.get()) is not None:
+            while (record := finished.get()) is not None:
                 if isinstance(record, Exception):
                     raise record
                 yield record
         finally:
-            with self._changed:
-                if self._newest.get(client) is job:
+            with self._lock:
+                if self._newest.get(client) is tiles:
                     del self._newest[client]
 
-    def _work(self) -> None:
-        use_threads(self._threads)  # OpenMP keeps a thread count for each calling thread
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._waiting)
-                job = self._waiting.pop(0)
-            if self._newest.get(job.client) is not job:
-                continue
-            try:
-                job.records.put(self._step(job))
-            except Exception as error:  # raised again in the thread of the client
-                job.records.put(error)
-                continue
-            if job.tiles or job.strides:
-                with self._changed:
-                    self._waiting.append(job)
-            else:
-                job.records.put(None)
-
-    def _step(self, job: _Job) -> bytes:
-        """Render the next tile of a job."""
-        if job.opened is None:
-            job.opened = self._model()
-            camera = job.view.frame.camera
-            job.strides = strides_of(camera.width, camera.height, median(self._rates))
-        if not job.tiles:
-            job.tiles = tiles_of(job.view, job.strides.pop(0), median(self._rates))
-        number, model = job.opened
-        tile = job.tiles.pop(0)
-        began = time.perf_counter()
-        seen = render_tile(model, job.view, tile)
-        self._rates.append((time.perf_counter() - began) / (tile.width * tile.height + _TILE_RAYS))
-        camera = job.view.coarse(tile.stride).camera
-        head = (tile.stride, tile.x, tile.y, tile.width, tile.height, camera.width, camera.height, number)
-        planes = np.moveaxis(seen.reshape(tile.height, tile.width, 3, 4), 2, 0)
-        return _HEAD.pack(*head) + np.ascontiguousarray(planes, "<f4").tobytes()
+    def _tiles(self, view: View) -> Iterator[bytes]:
+        """Render the tiles of a view, coarse pictures first."""
+        number, model = self._model()
+        camera = view.frame.camera
+        for stride in strides_of(camera.width, camera.height, median(self._rates)):
+            small = view.coarse(stride).camera
+            for tile in tiles_of(view, stride, median(self._rates)):
+                began = time.perf_counter()
+                seen = render_tile(model, view, tile)
+                self._rates.append((time.perf_counter() - began) / (tile.width * tile.height + _TILE_RAYS))
+                head = (tile.stride, tile.x, tile.y, tile.width, tile.height, small.width, small.height, number)
+                planes = np.moveaxis(seen.reshape(tile.height, tile.width, 3, 4), 2, 0)
+                yield _HEAD.pack(*head) + np.ascontiguousarray(planes, "<f4").tobytes()
