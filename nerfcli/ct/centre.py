@@ -6,6 +6,7 @@ it can only do if the geometry is right.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -182,12 +183,10 @@ def centre_of(row: Row, *, mirrored: bool = False) -> Centre:
     between = (columns // coarse.geometry.columns) / factor
     best = float(shifts[int(np.argmin(means))]) * between
     step = between / 2
-    misfits: dict[float, np.ndarray] = {}
 
+    @cache
     def errors(shift: float) -> np.ndarray:
-        if shift not in misfits:
-            misfits[shift] = misfit(fine, shift=shift, mirrored=mirrored)
-        return misfits[shift]
+        return misfit(fine, shift=shift, mirrored=mirrored)
 
     while step * factor > _PRECISE_PX * 4:
         around = [best - step, best, best + step]

@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from skimage.measure import marching_cubes
+from skimage.measure import block_reduce, marching_cubes
 
 from nerfcli.atomic import atomic_path
 from nerfcli.export.fusion import SIDE, FusedVolume
@@ -46,7 +46,7 @@ class Mesh:
 def surface_of(fused: FusedVolume, *, on_progress: Callable[[float], None] = lambda fraction: None) -> Mesh:
     """Return the mesh on which the signed distance is 0, between seen voxels."""
     keys, vertices, faces, count = [], [], [], 0
-    bricks = np.argwhere(_any_block(fused.index)) * _BRICK
+    bricks = np.argwhere(block_reduce(fused.index >= 0, _BRICK // SIDE, np.any)) * _BRICK  # those with a block
     for done, first in enumerate(bricks):
         found = _march(fused, first)
         on_progress((done + 1) / len(bricks))
@@ -95,14 +95,6 @@ def without_small_pieces(mesh: Mesh) -> Mesh:
     of_faces = piece[first]
     large = np.bincount(of_faces, minlength=piece.max() + 1) >= _SMALLEST_PIECE * len(first)
     return mesh_of(mesh.vertices, mesh.faces[large[of_faces]])
-
-
-def _any_block(index: np.ndarray) -> np.ndarray:
-    """Mark the bricks of 8^3 blocks that contain a block."""
-    size = _BRICK // SIDE
-    padded = np.pad(index >= 0, [(0, -length % size) for length in index.shape])
-    x, y, z = (length // size for length in padded.shape)
-    return np.asarray(padded.reshape(x, size, y, size, z, size).any(axis=(1, 3, 5)))
 
 
 def _march(fused: FusedVolume, first: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
