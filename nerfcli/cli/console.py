@@ -104,7 +104,7 @@ class Console:
             def update(fraction: float, detail: str) -> None:
                 nonlocal bar
                 if bar is None:
-                    bar = stack.enter_context(_bar(title) if sys.stderr.isatty() else _plain_lines(title))
+                    bar = stack.enter_context(_bar(title)) if sys.stderr.isatty() else _plain_lines(title)
                 bar(fraction, detail)
 
             yield Reporter(self.note, self.warn, no_progress if self.quiet else update)
@@ -144,8 +144,7 @@ def _bar(title: str) -> Iterator[Callable[[float, str], None]]:
         )
 
 
-@contextmanager
-def _plain_lines(title: str) -> Iterator[Callable[[float, str], None]]:
+def _plain_lines(title: str) -> Callable[[float, str], None]:
     last, clock = time.monotonic(), _Clock()
 
     def update(fraction: float, detail: str) -> None:
@@ -155,7 +154,7 @@ def _plain_lines(title: str) -> Iterator[Callable[[float, str], None]]:
             last = time.monotonic()
             _stderr(f"{title}: {100 * fraction:.0f} % {text}".rstrip())
 
-    yield update
+    return update
 
 
 class _Clock:

@@ -46,12 +46,10 @@ def report_runs(
     target = output.at(runs[0] / REPORT if len(runs) == 1 else runs[0].resolve().parent / REPORT)
     claim_page(output, target, mark_of(runs), about="report")
     resources.begin()
-    opened, facts, hashes = [], [], []
-    for path, label in zip(runs, labels_of(runs), strict=True):
-        run = load_run(path)
-        opened.append(run)
-        hashes.append(run.checkpoint_sha256())
-        facts.append(read_facts(run, label, checkpoint_sha256=hashes[-1]))
+    opened = [load_run(path) for path in runs]
+    hashes = [run.checkpoint_sha256() for run in opened]
+    described = zip(opened, labels_of(runs), hashes, strict=True)
+    facts = [read_facts(run, label, checkpoint_sha256=digest) for run, label, digest in described]
     depth = usual_depth(opened[0], Views("test"))
     origin = origin_of(facts, hashes, views=MOST_VIEWS, depth=depth)
     if keep and not output.overwrite and is_made_from(target, origin):
@@ -64,8 +62,8 @@ def report_runs(
             names[index] = shared
     looks, meanings = [], []
     reporter.progress(0.0, "")
-    for index, (run, described) in enumerate(zip(opened, facts, strict=True)):
-        on_progress = reporter.part(index / len(runs), (index + 1) / len(runs), described.label)
+    for index, (run, about) in enumerate(zip(opened, facts, strict=True)):
+        on_progress = reporter.part(index / len(runs), (index + 1) / len(runs), about.label)
         model = run.model(resources.torch_device)
         if model.sha256 != hashes[index]:
             hint = "run the command again when the training is complete"
