@@ -97,7 +97,7 @@ class _Handler(BaseHTTPRequestHandler):
         show, binary = self._of.show, "application/octet-stream"
         self._answer(
             {
-                "": self._page,
+                "": lambda: self._send(HTTPStatus.OK, "text/html; charset=utf-8", show.page()),
                 "photo": self._photo,
                 "version": lambda: self._send(HTTPStatus.OK, "application/json", json.dumps(show.version())),
                 "field": lambda: self._send(HTTPStatus.OK, binary, show.field()),
@@ -117,27 +117,15 @@ class _Handler(BaseHTTPRequestHandler):
             )
             return
         self._query = {name: values[-1] for name, values in parse_qs(address.query).items()}
-        handle = places.get(place)
-        if handle is None:
-            self._send(HTTPStatus.NOT_FOUND, "text/plain", "there is nothing here\n")
-            return
         try:
-            handle()
-        except UserError as error:
-            self._send(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", f"{error.message}: {error.hint}")
+            places[place]()
+        except UserError as error:  # a browser asks again: a training may write its field soon
+            text = f"{error.message}: {error.hint}\n"
+            self._send(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain; charset=utf-8", text, {"Refresh": "2"})
         except ValueError as error:
             self._send(HTTPStatus.BAD_REQUEST, "text/plain", str(error))
         except LookupError:
             self._send(HTTPStatus.NOT_FOUND, "text/plain", "there is nothing here\n")
-
-    def _page(self) -> None:
-        try:
-            text = self._of.show.page()
-        except UserError as error:  # a training may write its field soon
-            text = f"{error.message}: {error.hint}\n"
-            self._send(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain; charset=utf-8", text, {"Refresh": "2"})
-            return
-        self._send(HTTPStatus.OK, "text/html; charset=utf-8", text)
 
     def _photo(self) -> None:
         content = self._of.show.photo(int(self._query.get("n", "")), int(self._query.get("px", "800")))
