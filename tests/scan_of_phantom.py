@@ -1,11 +1,12 @@
 """Scans of the phantom, computed from its closed-form chords without any projector of the program."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from ellipsoids import Ellipsoid, bean, line_integrals
 
-from nerfcli.ct.geometry import Beam, Circle
+from nerfcli.ct.geometry import Beam, Circle, ScanGeometry
 from nerfcli.ct.scan import Scan, held_out_views
 
 
@@ -20,6 +21,19 @@ def phantom_circle(*, beam: Beam = "cone", views: int = 24, span_deg: float = 36
         source_origin=34.0 if beam == "cone" else 0.0,
         source_detector=68.0 if beam == "cone" else 0.0,
     )
+
+
+def transmissions(geometry: ScanGeometry, *, rows: int, columns: int) -> np.ndarray:
+    """Return the transmissions (V, H, W) of the bean, each a mean over rows x columns rays through its pixel."""
+    fine = replace(
+        geometry,
+        column_step=geometry.column_step / columns,
+        row_step=geometry.row_step / rows,
+        rows=geometry.rows * rows,
+        columns=geometry.columns * columns,
+    )
+    passed = np.exp(-line_integrals(bean(), *fine.rays()))
+    return passed.reshape(geometry.views, geometry.rows, rows, geometry.columns, columns).mean((2, 4))
 
 
 def scan_of_phantom(

@@ -14,9 +14,8 @@ import pytest
 import tifffile
 import torch
 from commands import completed, nerfcli, refusal
-from ellipsoids import attenuation_of_voxels, bean
 from scan_of_phantom import phantom_circle, scan_of_phantom
-from test_reconstruct import cone, scan_of
+from test_reconstruct import cone, scan_of, truth
 
 from nerfcli.ct.evaluate import score_projections, score_volume
 from nerfcli.ct.export import VolumeFile, export_scan, write_volume
@@ -35,18 +34,21 @@ from nerfcli.notices import Reporter
 from nerfcli.output import Output
 from nerfcli.photos.images import read_image
 
+# A geometry that is not estimated.
+FIXED = ("--centre", "0", "--tilt", "0")
+
 
 @pytest.fixture(scope="module")
 def bean_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scan of the bean with its truth beside it, and the run that `train` made of it."""
     folder = tmp_path_factory.mktemp("bean")
     grid = centred_grid((18.0, 18.0, 15.0), 0.8)
-    true = attenuation_of_voxels(bean(), x=grid.axis("x"), y=grid.axis("y"), z=grid.axis("z")).astype(np.float32)
+    true = truth(grid)
     np.save(folder / "truth.npy", true)
     scan = scan_of(cone(rows=18, columns=30, pixel=1.2), held_out=(0, 6, 12, 18, 24))
     described = described_truth(folder / "truth.npy", "zyx", true.shape, size=grid.size, attenuation_per_value=1.0)
     save_scan(folder / "bean", replace(scan, history={"truth": described}))
-    trained = completed("ct", "train", folder / "bean", "--passes", "8", "--centre", "0", "--tilt", "0")
+    trained = completed("ct", "train", folder / "bean", "--passes", "8", *FIXED)
     assert trained.stdout.strip() == str(folder / "bean-run")
     return folder / "bean-run"
 
@@ -57,7 +59,7 @@ def test_train_says_what_it_decided_and_keeps_a_run(bean_run: Path) -> None:
     assert any("model error" in sentence for sentence in result.decisions)
     assert result.grid.size == pytest.approx(0.8)
     scan = bean_run.with_name("bean")
-    again = ("ct", "train", scan, "--passes", "8", "--centre", "0", "--tilt", "0")
+    again = ("ct", "train", scan, "--passes", "8", *FIXED)
     assert "is kept" in completed(*again).stderr
     assert "another reconstruction" in refusal("ct", "train", scan, "--passes", "9")[0]
 
@@ -140,8 +142,7 @@ def test_residuals_are_those_of_the_open_beam_of_each_view(tmp_path: Path) -> No
     scan = scan_of(cone(rows=10, columns=48, pixel=1.2), held_out=(0, 7, 12, 19, 24))
     brighter = np.where(np.arange(30) % 2, 1.1, 1.0)[:, None, None]
     save_scan(tmp_path / "scan", replace(scan, values=(scan.values * brighter).astype(np.float32)))
-    fixed = ("--passes", "4", "--centre", "0", "--tilt", "0")
-    completed("ct", "train", tmp_path / "scan", *fixed, "--air", "measured")
+    completed("ct", "train", tmp_path / "scan", "--passes", "4", *FIXED, "--air", "measured")
     for views in ("test", "train"):
         rendered = completed("ct", "render", tmp_path / "scan-run", "--cameras", views, "--outputs", "residual")
         beside = np.array([tifffile.imread(path)[:, :3] for path in rendered.stdout.splitlines()])
@@ -151,8 +152,7 @@ def test_residuals_are_those_of_the_open_beam_of_each_view(tmp_path: Path) -> No
 def test_a_scan_without_held_out_views_is_evaluated(tmp_path: Path) -> None:
     """Regression: a traceback where the open beam was corrected."""
     save_scan(tmp_path / "scan", scan_of(cone(9, rows=2, columns=8, pixel=4.0)))
-    fixed = ("--passes", "1", "--centre", "0", "--tilt", "0", "--air", "measured")
-    completed("ct", "train", tmp_path / "scan", *fixed)
+    completed("ct", "train", tmp_path / "scan", "--passes", "1", *FIXED, "--air", "measured")
     assert load_reconstruction(tmp_path / "scan-run").used["air"] is not None
     evaluated = completed("ct", "evaluate", tmp_path / "scan-run", "--json")
     assert json.loads(evaluated.stdout.splitlines()[-1])["methods"]["nerfcli"]["projections"] is None
@@ -162,7 +162,7 @@ def test_resume_goes_on_from_the_volume_with_the_settings_that_are_not_given(bea
     """Regression: it was refused unless all of them were given again."""
     run = tmp_path / "run"
     again = ("ct", "train", bean_run.with_name("bean"), "-o", run, "--passes")
-    fixed = ("--voxel-size", "3", "--tv", "0.5", "--centre", "0", "--tilt", "0")
+    fixed = ("--voxel-size", "3", "--tv", "0.5", *FIXED)
     completed(*again, "1", *fixed)
     first = load_reconstruction(run)
     assert first.passes == 1
@@ -198,8 +198,7 @@ def test_an_interrupted_fit_is_not_complete_and_resume_goes_on_from_it(bean_run:
     saved = f"the volume of pass {interrupted.passes} is saved in {run}"
     assert notes == [f"{saved}; to continue, add --resume to the same command"]
 
-    fixed = ("--centre", "0", "--tilt", "0", "--tv", "1", "--air", "stated")
-    command = ("ct", "train", scan, "--passes", "3", *fixed, "-o", run)
+    command = ("ct", "train", scan, "--passes", "3", *FIXED, "--tv", "1", "--air", "stated", "-o", run)
     assert refusal(*command)[0] == f"Error: {run} holds a fit that was interrupted after pass {interrupted.passes}"
     assert completed(*command, "--resume").stdout == f"{run}\n"
     result = load_reconstruction(run)
@@ -225,8 +224,7 @@ def test_an_interrupt_between_fit_and_save_waits(
 def test_a_damaged_run_is_trained_again_as_the_hint_says(bean_run: Path, tmp_path: Path) -> None:
     run = shutil.copytree(bean_run, tmp_path / "run")
     (run / "marks.npy").unlink()
-    fixed = ("--passes", "1", "--voxel-size", "3", "--centre", "0")
-    again = ("ct", "train", bean_run.with_name("bean"), "-o", run, *fixed)
+    again = ("ct", "train", bean_run.with_name("bean"), "-o", run, "--passes", "1", "--voxel-size", "3", *FIXED)
     error, hint = refusal(*again)
     assert error.startswith(f"Error: {run} cannot be read as a reconstruction")
     assert hint.startswith("Hint:  train the scan again with --overwrite")

@@ -1,6 +1,5 @@
 """The phantom itself: its chords beside quadrature, and beside the closed form of a sphere."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import make_phantom
@@ -10,6 +9,7 @@ import tifffile
 import torch
 from commands import error_of, nerfcli
 from ellipsoids import Ellipsoid, attenuation_at, attenuation_of_voxels, bean, line_integrals
+from scan_of_phantom import transmissions
 
 from nerfcli.ct.convert import read_scan
 from nerfcli.ct.likelihood import likelihood_of
@@ -45,14 +45,7 @@ def test_the_sample_scan_follows_its_statement(monkeypatch: pytest.MonkeyPatch, 
     scan = read_scan(PHANTOM)
     assert (scan.geometry.views, scan.geometry.rows, scan.geometry.columns) == (48, 48, 64)
     every, n = np.arange(scan.geometry.views), make_phantom.SUBPIXELS
-    fine = replace(
-        scan.geometry,
-        column_step=scan.geometry.column_step / n,
-        row_step=scan.geometry.row_step / n,
-        rows=48 * n,
-        columns=64 * n,
-    )
-    passed = np.exp(-line_integrals(bean(), *fine.rays())).reshape(48, 48, n, 64, n).mean((2, 4))
+    passed = transmissions(scan.geometry, rows=n, columns=n)
     integrals = torch.from_numpy(-np.log(passed).reshape(len(every), -1)).float()
     deviance = likelihood_of(scan, every).deviance(integrals, torch.from_numpy(every))
     # The flats are counts, too: their mean adds its own variance, in proportion to what passes.

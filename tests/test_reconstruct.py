@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from ellipsoids import attenuation_of_voxels, bean, line_integrals
+from scan_of_phantom import transmissions
 from scipy.ndimage import binary_erosion
 from tomography import sart_total_variation
 
@@ -43,16 +44,7 @@ def cone(views: int = 30, *, rows: int = 24, columns: int = 40, pixel: float = 0
 
 def scan_of(geometry: ScanGeometry, *, photons: float = PHOTONS, held_out: tuple[int, ...] = ()) -> Scan:
     """Return Poisson counts of the bean, scaled so that `photons` are a value of 1,000; a pixel averages 3 x 3 rays."""
-    parts = 3 if geometry.rows > 1 else 1
-    fine = replace(
-        geometry,
-        column_step=geometry.column_step / 3,
-        row_step=geometry.row_step / parts,
-        rows=geometry.rows * parts,
-        columns=geometry.columns * 3,
-    )
-    passed = np.exp(-line_integrals(bean(), *fine.rays()))
-    passed = passed.reshape(geometry.views, geometry.rows, parts, geometry.columns, 3).mean((2, 4))
+    passed = transmissions(geometry, rows=3 if geometry.rows > 1 else 1, columns=3)
     counts = np.random.default_rng(0).poisson(photons * passed)
     values = (counts * (1000 / photons)).astype(np.float32)
     beam = np.full((1, 1, 1), 1000, dtype=np.float32)
