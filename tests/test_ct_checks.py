@@ -189,7 +189,7 @@ def test_the_command_writes_a_page_and_holds_a_gate(tmp_path: Path) -> None:
 
 def test_flats_determine_the_number_of_photons() -> None:
     """Known truth, within 5 %: 8000 photons a pixel at a gain of 0.25 values a photon, with read noise and drift."""
-    from nerfcli.ct.open_beam import open_beam_of
+    from nerfcli.ct.formats.assemble import open_beam_of
 
     rng = np.random.default_rng(0)
     lamp = 1 + 0.02 * rng.normal(size=(12, 1, 1))

@@ -21,7 +21,7 @@ from nerfcli.ct.centre import (
 )
 from nerfcli.ct.formats.assemble import axis_column
 from nerfcli.ct.grid import WEDGE_DEG, gaps_deg
-from nerfcli.ct.open_beam import MEDIAN_DEVIATION
+from nerfcli.ct.likelihood import MEDIAN_DEVIATION
 from nerfcli.ct.scan import Scan
 from nerfcli.errors import several
 from nerfcli.pages.findings import BAD, GOOD, Finding, finding, verdict_above, verdict_below, worst

@@ -17,8 +17,10 @@ import torch
 from scipy.optimize import root_scalar
 from torch import Tensor
 
-from nerfcli.ct.open_beam import MEDIAN_DEVIATION
 from nerfcli.ct.scan import Scan
+
+# Median of |x - median| of a normal distribution, as a fraction of its standard deviation.
+MEDIAN_DEVIATION = 0.6745
 
 
 @dataclass(frozen=True)

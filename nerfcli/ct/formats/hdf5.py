@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.ct.formats.assemble import ReaderOutput
+from nerfcli.ct.formats.assemble import ReaderOutput, open_beam_of
 from nerfcli.ct.formats.statement import angles_in_radians, millimetres
 from nerfcli.ct.geometry import Circle
-from nerfcli.ct.open_beam import open_beam_of
 from nerfcli.ct.recognise import datasets_in, open_hdf5
 from nerfcli.errors import UserError
 

@@ -30,11 +30,10 @@ from typing import Any
 
 import numpy as np
 
-from nerfcli.ct.formats.assemble import ReaderOutput
+from nerfcli.ct.formats.assemble import OpenBeam, ReaderOutput, open_beam_of
 from nerfcli.ct.formats.pictures import SUFFIXES, numbered, read_npy, read_stack
 from nerfcli.ct.formats.statement import Statement, angles_in_radians, millimetres, read_object
 from nerfcli.ct.geometry import BEAMS, Beam, Circle, ScanGeometry, from_vectors
-from nerfcli.ct.open_beam import OpenBeam, open_beam_of
 from nerfcli.ct.recognise import STACK
 from nerfcli.ct.scan import KINDS, described_truth
 from nerfcli.errors import UserError
