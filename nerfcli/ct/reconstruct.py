@@ -174,8 +174,9 @@ def reconstruct(
                 ahead = moved + (inertia - 1) / following * (moved - volume)
                 inertia = following
             volume = moved
-            fraction = _fraction(done + (number + 1) / len(subsets), passes, time.perf_counter() - begun, seconds)
-            progress(fraction, f"pass {fit.passes + done + 1}")
+            part, spent = done + (number + 1) / len(subsets), time.perf_counter() - begun
+            fraction = max(part / passes if passes else 0.0, spent / seconds if seconds else 0.0)
+            progress(min(1.0, fraction), f"pass {fit.passes + done + 1}")
         done += 1
         if objective < best:
             best, best_volume = objective, before
@@ -212,8 +213,3 @@ def _subsets(count: int, number: int) -> list[np.ndarray]:
     number = max(1, number)
     order = sorted(range(number), key=lambda s: int(format(s, "016b")[::-1], 2))
     return [np.arange(s, count, number) for s in order]
-
-
-def _fraction(done: float, passes: int | None, spent: float, seconds: float | None) -> float:
-    fractions = [done / passes if passes else 0.0, spent / seconds if seconds else 0.0]
-    return min(1.0, max(fractions))

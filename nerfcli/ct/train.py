@@ -4,7 +4,7 @@ import math
 import platform
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -228,7 +228,13 @@ def _estimates(
     def left() -> float | None:
         return None if deadline == math.inf else max(deadline - time.perf_counter(), 0.0)
 
-    centre, tilt = _geometry(scan, settings, decisions, progress, left)
+    centre = _centre(scan, decisions, progress) if settings.centre is None else settings.centre
+    tilt = settings.tilt
+    if tilt is None:
+        progress(0.0, "detector tilt")
+        # At most half of the time for estimates, so that the noise is judged too.
+        most = None if (seconds := left()) is None else seconds / 2
+        tilt = _tilt(replace(scan, geometry=scan.geometry.shifted(centre)), decisions, most)
     geometry = scan.geometry.corrected(centre, tilt)
     grid = grid_of_scan(geometry, settings.voxel_size)
     progress(0.0, "noise and model error")
@@ -254,40 +260,34 @@ def seconds_left(total: float | None, begun: float) -> float | None:
     return None if total is None else max(total - (time.perf_counter() - begun), LEAST_FRACTION * total)
 
 
-def _geometry(
-    scan: Scan,
-    settings: ReconstructionSettings,
-    decisions: list[str],
-    progress: Progress,
-    left: Callable[[], float | None],
-) -> tuple[float, float]:
-    centre, tilt = settings.centre, settings.tilt
-    if centre is None and len(scan.training_views) < FEWEST_VIEWS:
-        centre = 0.0
-    if centre is None:
-        progress(0.0, "centre of rotation")
-        found = centre_of(highest_contrast_row(scan, scan.training_views).thinned())
-        centre = found.shift if found.is_off else 0.0
-        if found.is_off:
-            stated = axis_column(scan.geometry)
-            decisions.append(
-                f"centre of rotation: axis at column {stated - found.shift:.2f} ± {found.error:.2f}; "
-                f"the scan states {stated:.2f}"
-            )
-    if tilt is None:
-        progress(0.0, "detector tilt")
-        # At most half of the time for estimates, so that the noise is judged too.
-        most = None if (seconds := left()) is None else seconds / 2
-        found = detector_tilt(replace(scan, geometry=scan.geometry.shifted(centre)), seconds=most)
-        tilt = found.value if found.holds else 0.0
-        if math.isinf(found.error):
-            decisions.append("detector tilt: not estimated, for lack of time; set --tilt, or give a larger --budget")
-        if found.holds:
-            decisions.append(
-                f"detector tilt: {np.rad2deg(found.value):+.2f} degrees, which lowers chi-square of left-out views "
-                f"by {found.gain:.3g} ± {found.error:.2g}"
-            )
-    return centre, tilt
+def _centre(scan: Scan, decisions: list[str], progress: Progress) -> float:
+    """Return the shift of the detector that the views show; 0 where there are too few, or the stated centre holds."""
+    if len(scan.training_views) < FEWEST_VIEWS:
+        return 0.0
+    progress(0.0, "centre of rotation")
+    found = centre_of(highest_contrast_row(scan, scan.training_views).thinned())
+    if not found.is_off:
+        return 0.0
+    stated = axis_column(scan.geometry)
+    decisions.append(
+        f"centre of rotation: axis at column {stated - found.shift:.2f} ± {found.error:.2f}; "
+        f"the scan states {stated:.2f}"
+    )
+    return found.shift
+
+
+def _tilt(scan: Scan, decisions: list[str], seconds: float | None) -> float:
+    """Return the rotation of the detector that the views show; 0 where it does not hold, or for lack of time."""
+    found = detector_tilt(scan, seconds=seconds)
+    if math.isinf(found.error):
+        decisions.append("detector tilt: not estimated, for lack of time; set --tilt, or give a larger --budget")
+    if not found.holds:
+        return 0.0
+    decisions.append(
+        f"detector tilt: {np.rad2deg(found.value):+.2f} degrees, which lowers chi-square of left-out views "
+        f"by {found.gain:.3g} ± {found.error:.2g}"
+    )
+    return found.value
 
 
 def _air(

@@ -173,35 +173,7 @@ def unpacked(data: bytes) -> Gaussians:
     *arrays, more = np.split(np.frombuffer(data, np.uint8, offset=_HEADER.size), ends)
     if flags & _EXTENSIONS:
         _check_axes(more.tobytes())
-    return _decoded(*(array.reshape(count, -1) for array in arrays), bits=bits)
-
-
-def _counted(head: bytes) -> tuple[int, int]:
-    """Return the number of Gaussians that a header states, and the number of bytes that they take after it."""
-    if len(head) < _HEADER.size:
-        raise ValueError(f"it ends after {len(head)} bytes, within its header")
-    magic, version, count, degree, *_ = _HEADER.unpack_from(head)
-    if magic != _MAGIC or version not in (2, 3) or degree > 3 or not count:
-        raise ValueError(f"version {version}, {count} splats of degree {degree}")
-    return count, count * sum(_widths(version, degree))
-
-
-def _widths(version: int, degree: int) -> list[int]:
-    """Return the bytes per Gaussian of positions, opacities, colours, scales, rotations and harmonics."""
-    return [9, 1, 3, 3, 4 if version == 3 else 3, 3 * ((degree + 1) ** 2 - 1)]
-
-
-def _decoded(
-    positions: np.ndarray,
-    opacities: np.ndarray,
-    colours: np.ndarray,
-    sizes: np.ndarray,
-    rotations: np.ndarray,
-    rest: np.ndarray,
-    *,
-    bits: int,
-) -> Gaussians:
-    """Return the Gaussians of arrays (N, bytes)."""
+    positions, opacities, colours, sizes, rotations, rest = (array.reshape(count, -1) for array in arrays)
     whole = np.zeros((len(positions), 3, 4), np.uint8)
     whole[..., 1:] = positions.reshape(-1, 3, 3)
     means = (whole.view("<i4")[..., 0] >> 8) * 2.0**-bits  # the shift keeps the sign
@@ -217,6 +189,21 @@ def _decoded(
         np.log(opacity / (1 - opacity)),
         harmonics * _HARMONIC_SIGNS[: harmonics.shape[1], None],
     )
+
+
+def _counted(head: bytes) -> tuple[int, int]:
+    """Return the number of Gaussians that a header states, and the number of bytes that they take after it."""
+    if len(head) < _HEADER.size:
+        raise ValueError(f"it ends after {len(head)} bytes, within its header")
+    magic, version, count, degree, *_ = _HEADER.unpack_from(head)
+    if magic != _MAGIC or version not in (2, 3) or degree > 3 or not count:
+        raise ValueError(f"version {version}, {count} splats of degree {degree}")
+    return count, count * sum(_widths(version, degree))
+
+
+def _widths(version: int, degree: int) -> list[int]:
+    """Return the bytes per Gaussian of positions, opacities, colours, scales, rotations and harmonics."""
+    return [9, 1, 3, 3, 4 if version == 3 else 3, 3 * ((degree + 1) ** 2 - 1)]
 
 
 def _check_axes(extensions: bytes) -> None:
