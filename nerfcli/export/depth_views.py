@@ -10,8 +10,8 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import apply, from_parts, rotation_from_vector
 from nerfcli.photos.colours import to_8_bit
-from nerfcli.photos.loading import pinhole_of
-from nerfcli.render.coverage import DepthMap, normals_of_points
+from nerfcli.photos.loading import pinhole_frame
+from nerfcli.render.coverage import DepthMap, normals_of_points, small_frame
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
@@ -88,10 +88,7 @@ def _small_pinholes(frame: Frame, max_size: int) -> list[Frame]:
     """
     camera, pose = frame.camera, frame.world_from_cam
     if not camera.is_spherical:
-        factor = max(1.0, max(camera.size) / max_size)
-        pinhole = pinhole_of(camera)
-        small = pinhole.resized(max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
-        return [replace(frame, camera=small)]
+        return [small_frame(pinhole_frame(frame), max_size)]
     side = max(1, min(camera.width // 4, max_size // 2))
     face = Camera.pinhole(side, side, side / 2)  # 90 degrees
     poses = [from_parts(pose[:3, :3] @ turn, pose[:3, 3]) for turn in _TURNS]

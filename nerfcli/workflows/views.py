@@ -15,6 +15,7 @@ from nerfcli.captures.loading import with_photos_on_disk
 from nerfcli.errors import UserError
 from nerfcli.notices import Notify
 from nerfcli.photos.loading import downscaled_camera
+from nerfcli.render.coverage import small_frame
 from nerfcli.render.depth import DepthRequest
 from nerfcli.training.runs.run import Run
 
@@ -129,7 +130,7 @@ def frames_of_file(views: Views) -> list[Frame]:
 def _presented(chosen: Sequence[Frame], views: Views) -> list[Frame]:
     """Return frames with the size, lens and crop of the views."""
     if views.max_size is not None:
-        chosen = [replace(frame, camera=_within(frame.camera, views.max_size)) for frame in chosen]
+        chosen = [small_frame(frame, views.max_size) for frame in chosen]
     # Frames that share a camera share the new one too, and with it its rays.
     look = lru_cache(views.look.of)
     return [replace(frame, camera=look(frame.camera)) for frame in chosen]
@@ -175,8 +176,3 @@ def file_fps(cameras: str) -> float | None:
     path = Path(cameras)
     found = find_camera_path(path) if path.is_file() else None
     return None if found is None else read_path(found).fps
-
-
-def _within(camera: Camera, max_size: int) -> Camera:
-    """Return the camera, reduced if necessary so that its longer side is at most `max_size` pixels."""
-    return downscaled_camera(camera, max(1.0, max(camera.width, camera.height) / max_size))
