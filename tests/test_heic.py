@@ -58,12 +58,14 @@ def test_its_exif_is_that_of_a_jpeg(tmp_path: Path):
     file = {tags.DateTimeOriginal: "2026:11:27 10:00:00", tags.ExifImageWidth: WIDTH, tags.ExifImageHeight: HEIGHT}
     north = {gps.GPSLatitudeRef: "N", gps.GPSLatitude: (43.0, 39.0, 0.0)}
     west = {gps.GPSLongitudeRef: "W", gps.GPSLongitude: (79.0, 23.0, 0.0)}
-    exif = exif_with(phone, {ExifTags.IFD.Exif: shot | file, ExifTags.IFD.GPSInfo: north | west})
+    above = {gps.GPSAltitudeRef: b"\0", gps.GPSAltitude: 520.5}
+    exif = exif_with(phone, {ExifTags.IFD.Exif: shot | file, ExifTags.IFD.GPSInfo: north | west | above})
     pixels = noise(HEIGHT, WIDTH, 3)
     Image.fromarray(pixels).save(tmp_path / "a.jpg", exif=exif)
     found = read_exif(write_heic(tmp_path / "b.heic", pixels, exif=exif.tobytes()))
     assert found == read_exif(tmp_path / "a.jpg")
-    assert (found.focal_35mm, found.gps and round(found.gps[1], 2)) == (26, -79.38)
+    assert found.focal_35mm == 26
+    assert found.gps == pytest.approx((43.65, -79 - 23 / 60, 520.5), abs=1e-9)
 
 
 def test_colours_of_display_p3_become_those_of_srgb(tmp_path: Path):
