@@ -23,7 +23,7 @@ from nerfcli.cameras.alignment import align
 from nerfcli.matching.graph import bottlenecks, connected_groups, consistent_groups
 from nerfcli.poses.engine import attempts, mapping, remap
 from nerfcli.poses.engine.attempts import map_with_fallbacks
-from nerfcli.poses.engine.database import register_photos
+from nerfcli.poses.engine.database import copied, register_photos
 from nerfcli.poses.engine.features import match
 from nerfcli.poses.engine.initial_lens import detect_fisheyes
 from nerfcli.poses.engine.mapping import MappedModels, MapperOptions, map_photos
@@ -781,7 +781,7 @@ def test_a_copy_of_the_database_is_removed_whatever_happens(solved: Solved, tmp_
     job = job_again(solved, tmp_path / "again")
 
     def interrupted() -> None:
-        with remap._copied(job) as copy:
+        with copied(job, "remapped") as copy:
             copy.database.with_name("remapped.db-wal").write_bytes(b"a log")
             raise KeyboardInterrupt
 

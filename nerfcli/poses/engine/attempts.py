@@ -7,7 +7,8 @@ recorded with its result.
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -15,9 +16,9 @@ import pycolmap
 
 from nerfcli.errors import duration
 from nerfcli.matching.graph import connected_groups
-from nerfcli.poses.engine.database import feature_counts, register_photos
+from nerfcli.poses.engine.database import camera_of_group, copied, feature_counts, register_photos
 from nerfcli.poses.engine.features import extract, match, start_matching
-from nerfcli.poses.engine.initial_lens import detect_fisheyes, estimate_focal_lengths
+from nerfcli.poses.engine.initial_lens import detect_fisheyes, estimate_focal_lengths, tell_of_exif
 from nerfcli.poses.engine.mapping import MappedModels, MapperOptions, map_photos, mapper_limit_seconds
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import ALL_ALIKE_UP_TO, all_pairs
@@ -28,7 +29,8 @@ from nerfcli.poses.model.intrinsics import FISHEYE_FROM_DEG, field_of_view_deg
 from nerfcli.poses.model.lens_evidence import lenses_of
 from nerfcli.poses.model.locate import left_out, locate_photos
 from nerfcli.poses.model.merging import merge_models
-from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES
+from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES, MIN_MATCHES
+from nerfcli.poses.model.rotations import misleading_pairs
 from nerfcli.poses.model.two_views import count_matches, read_verified_pairs
 
 # Registered fraction below which mapping is tried again; if only a photo or two are missing, they are often at fault.
@@ -41,8 +43,6 @@ _MANY_PHOTOS = 250
 _MOST_FOR_ALL = 150
 # Searching larger pictures may take this many times as long as the first search, times the fraction of missing photos.
 _MOST_FOR_MORE = 5.0
-# A focal length that differs from EXIF's by more than this factor (its logarithm) is reported.
-_FAR_FROM_EXIF = 0.1
 # Each single photo takes some seconds; if more than this are missing, the problem is not one of single photos.
 _MOST_SINGLE_PHOTOS = 60
 
@@ -61,7 +61,7 @@ def map_with_fallbacks(job: Job, report: Report, tell: Tell = lambda text: None)
     """
     given = estimate_focal_lengths(job, tell)
     attempts = MappingAttempts(given, report, tell)
-    attempts.map("default thresholds", MapperOptions())
+    attempts.map("default thresholds", MapperOptions(), without=_misleading(given, tell))
     if attempts.too_many_left_out() and _only_turns(given):
         attempts.tell_results()
         tell("not trying anything else: the camera stood still or turned on the spot")
@@ -74,7 +74,8 @@ def map_with_fallbacks(job: Job, report: Report, tell: Tell = lambda text: None)
     locate_single_photos(attempts)
     if len(attempts.record) > 1:
         attempts.tell_results()
-    _tell_of_exif(given, attempts.best, tell)
+    if attempts.best.models:
+        tell_of_exif(given, attempts.best.job, attempts.best.models[0], tell)
     return attempts.result()
 
 
@@ -153,14 +154,18 @@ class MappingAttempts:
             self.tell(f"{attempt['what']}: {largest}{also} of {self.photos} photos registered")
         self._reported = len(self.record)
 
-    def map(self, what: str, start: MapperOptions) -> None:
-        """Map from scratch and merge sub-models; the result counts if it places more photos than the best so far."""
+    def map(self, what: str, start: MapperOptions, *, without: Set[frozenset[int]] = frozenset()) -> None:
+        """Map from scratch and merge sub-models; the result counts if it places more photos than the best so far.
+
+        The mapper does not see the pairs `without`, image ids.
+        """
         if self.record:
             if not self.has_time():
                 return
             self.announce(what)
         job = self.job
-        models = self._run_mapper(what, job, start)
+        with copied(job, "reduced", without=without) if without else nullcontext(job) as seen:
+            models = self._run_mapper(what, seen, start)
         self.take(what, models, job)
         if len(models) > 1:
             seconds = mapper_limit_seconds(self.photos)
@@ -359,21 +364,16 @@ def _without_exif(job: Job) -> Job:
     return replace(job, groups=tuple(groups))
 
 
-def _tell_of_exif(given: Job, best: MappedModels, tell: Tell) -> None:
-    """Tell the user where the resulting focal length differs from EXIF's, which was not used.
-
-    Photos of a camera that moves straight ahead determine the focal length poorly.
-    """
-    cameras = best.models[0].cameras if best.models else {}  # of registered photos
-    for number, (group, used) in enumerate(zip(given.groups, best.job.groups, strict=True), start=1):
-        if group.focal_px is None or used.focal_px is not None or number not in cameras:
-            continue
-        found_px = cameras[number].mean_focal_length()
-        if abs(math.log(found_px / group.focal_px)) > _FAR_FROM_EXIF:
-            tell(
-                f"EXIF's focal length ({group.focal_px:.0f} px) was not used, since few photos registered with it; the "
-                f"photos give {found_px:.0f} px: if EXIF is right, give --intrinsics"
-            )
+def _misleading(job: Job, tell: Tell) -> Set[frozenset[int]]:
+    """Return the pairs that mislead the mapper, and tell the user how many they are."""
+    pairs = read_verified_pairs(job.database, min_matches=MIN_MATCHES)
+    cameras = {job.image_ids[photo]: camera_of_group(group) for group in job.groups for photo in group.photos}
+    found = misleading_pairs(pairs, cameras, job.solver)
+    if found:
+        tell(
+            f"mapping without {len(found)} of {len(pairs)} pairs of photos: the rotations of the others contradict them"
+        )
+    return found
 
 
 def _only_turns(job: Job) -> bool:

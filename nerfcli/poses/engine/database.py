@@ -8,9 +8,11 @@ pycolmap has its own SQLite library. Two SQLite libraries must not have a file o
 the locks of the other are dropped. So Python's is used only while pycolmap has the database closed.
 """
 
+import shutil
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Set
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +127,29 @@ def remove_database(path: Path) -> None:
     """Remove a database, if it exists, with the logs that SQLite keeps beside it."""
     for log in ("", "-wal", "-shm", "-journal"):
         path.with_name(path.name + log).unlink(missing_ok=True)
+
+
+@contextmanager
+def copied(
+    job: Job, name: str, *, without: Set[frozenset[int]] = frozenset(), cameras: pycolmap.Reconstruction | None = None
+) -> Iterator[Job]:
+    """Give the job of a copy of the database, called `name`, without some pairs and with the cameras of a model.
+
+    The mapper can only extend a model with the same lenses. Of an earlier copy, nothing may be left: SQLite would apply
+    its write-ahead log to this one.
+    """
+    kept = tuple(pair for pair in job.pairs if frozenset(job.image_ids[number] for number in pair) not in without)
+    copy = replace(job, variant=name, pairs=kept)
+    remove_database(copy.database)
+    shutil.copyfile(job.database, copy.database)
+    try:
+        keep_geometries(copy, kept)
+        with pycolmap.Database.open(copy.database) as database:
+            for camera in () if cameras is None else cameras.cameras.values():
+                database.update_camera(camera)
+        yield copy
+    finally:
+        remove_database(copy.database)
 
 
 def name_images(job: Job) -> None:

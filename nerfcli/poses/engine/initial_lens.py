@@ -10,6 +10,7 @@ camera. Without a known lens, matches may agree on any fundamental matrix, which
 known lens; so a perspective photo never gains by a fisheye.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -47,6 +48,8 @@ _FISHEYE_FOCAL_FRACTIONS = np.geomspace(0.25, 0.85, 8)
 # More matches must agree by this factor.
 _CLEARLY_MORE = 1.1
 _LEAST_FISHEYE_MATCHES = 60
+# A focal length that differs from EXIF's by more than this factor (its logarithm) is reported.
+_FAR_FROM_EXIF = 0.1
 
 
 def estimate_focal_lengths(job: Job, tell: Tell) -> Job:
@@ -178,6 +181,22 @@ def _lowest(focal_px: Array, costs: Array) -> float:
     bend = before - 2 * lowest + after
     offset = np.clip((before - after) / (2 * bend), -0.5, 0.5) if bend > 0 else 0.0
     return float(focal_px[index] * (focal_px[1] / focal_px[0]) ** offset)
+
+
+def tell_of_exif(given: Job, used: Job, model: pycolmap.Reconstruction, tell: Tell) -> None:
+    """Tell the user where a model's focal length differs from EXIF's, which was not used.
+
+    Photos of a camera that moves straight ahead determine the focal length poorly.
+    """
+    for number, (group, taken) in enumerate(zip(given.groups, used.groups, strict=True), start=1):
+        if group.focal_px is None or taken.focal_px is not None or number not in model.cameras:
+            continue
+        found_px = model.cameras[number].mean_focal_length()
+        if abs(math.log(found_px / group.focal_px)) > _FAR_FROM_EXIF:
+            tell(
+                f"EXIF's focal length ({group.focal_px:.0f} px) was not used, since few photos registered with it; the "
+                f"photos give {found_px:.0f} px: if EXIF is right, give --intrinsics"
+            )
 
 
 def detect_fisheyes(job: Job) -> Job | None:

@@ -5,10 +5,8 @@ different evidence each time; a model must pass the same checks, against all pai
 the mapper gave up after a few failures in a row: they often fit the adjusted model, with its lens.
 """
 
-import shutil
 import time
-from collections.abc import Callable, Iterator, Set
-from contextlib import contextmanager
+from collections.abc import Callable, Set
 from dataclasses import dataclass, replace
 
 import pycolmap
@@ -16,7 +14,7 @@ import pycolmap
 from nerfcli.errors import duration, several
 from nerfcli.matching.graph import consistent_groups
 from nerfcli.poses.engine.attempts import SMALLER_BASELINE
-from nerfcli.poses.engine.database import keep_geometries, remove_database
+from nerfcli.poses.engine.database import copied
 from nerfcli.poses.engine.mapping import MappedModels, MapperOptions, map_globally, map_photos, mapper_limit_seconds
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import FOLLOWERS, capture_order
@@ -225,13 +223,13 @@ def _extend_part(
 
 def _extend(base: pycolmap.Reconstruction, suspects: _Pairs, job: Job, report: Report) -> list[pycolmap.Reconstruction]:
     # Attempts are numbered after all of the first mapping; the number is added to the seed.
-    with _copied(job, without=suspects, cameras=base) as copy:
+    with copied(job, "remapped", without=suspects, cameras=base) as copy:
         return map_photos(copy, report, attempt=100, start=MapperOptions(), base=base)
 
 
 def _map_from_scratch(suspects: _Pairs, job: Job, report: Report) -> list[pycolmap.Reconstruction]:
     """Map without the suspects, with another seed and a smaller initial baseline."""
-    with _copied(job, without=suspects) as copy:
+    with copied(job, "remapped", without=suspects) as copy:
         return map_photos(copy, report, attempt=101, start=SMALLER_BASELINE)
 
 
@@ -240,28 +238,5 @@ def _map_globally(part: pycolmap.Reconstruction, job: Job) -> list[pycolmap.Reco
     known = pycolmap.Reconstruction(part)
     for camera in known.cameras.values():
         camera.has_prior_focal_length = True
-    with _copied(job, cameras=known) as copy:
+    with copied(job, "remapped", cameras=known) as copy:
         return map_globally(copy)
-
-
-@contextmanager
-def _copied(
-    job: Job, *, without: _Pairs = frozenset(), cameras: pycolmap.Reconstruction | None = None
-) -> Iterator[Job]:
-    """Give the job of a copy of the database, without some pairs and with the cameras of a model.
-
-    The mapper can only extend a model with the same lenses. Of an earlier copy, nothing may be left: SQLite would apply
-    its write-ahead log to this one.
-    """
-    kept = tuple(pair for pair in job.pairs if frozenset(job.image_ids[number] for number in pair) not in without)
-    copy = replace(job, variant="remapped", pairs=kept)
-    remove_database(copy.database)
-    shutil.copyfile(job.database, copy.database)
-    try:
-        keep_geometries(copy, kept)
-        with pycolmap.Database.open(copy.database) as database:
-            for camera in () if cameras is None else cameras.cameras.values():
-                database.update_camera(camera)
-        yield copy
-    finally:
-        remove_database(copy.database)

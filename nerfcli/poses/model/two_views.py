@@ -97,15 +97,20 @@ def agreements(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) ->
     """Compare each pair's matches with the model's poses and intrinsics; pairs without a finite ray are left out."""
     found = []
     for pair in placed_pairs(model, pairs):
-        seen = _compared(_cameras(model, pair), (pair.pixels_one, pair.pixels_other), _other_from_one(model, pair))
+        seen = compared(_cameras(model, pair), (pair.pixels_one, pair.pixels_other), _other_from_one(model, pair))
         judged = np.isfinite(seen.parallax)
         if not judged.any():
             continue
-        # Noise decides on which side of the cameras nearly parallel rays meet.
-        fits = (seen.parallax_px < _MOST_PX) | ((np.abs(seen.line_px) < _MOST_PX) & ~seen.behind)
         angle_deg = float(np.degrees(np.median(seen.parallax[judged])))
-        found.append(PairAgreement(pair.one, pair.other, seen.count, float(fits[judged].mean()), angle_deg))
+        found.append(PairAgreement(pair.one, pair.other, seen.count, fitting(seen), angle_deg))
     return found
+
+
+def fitting(seen: Agreement) -> float:
+    """Return the fraction of the matches with two rays that fit, see `PairAgreement`; there are some."""
+    # Noise decides on which side of the cameras nearly parallel rays meet.
+    fits = (seen.parallax_px < _MOST_PX) | ((np.abs(seen.line_px) < _MOST_PX) & ~seen.behind)
+    return float(fits[np.isfinite(seen.parallax)].mean())
 
 
 def rays(camera: pycolmap.Camera, pixels: Array) -> Array:
@@ -147,7 +152,7 @@ def _rotation_error(model: pycolmap.Reconstruction, pair: VerifiedPair, *, seed:
     if found is None:
         return None
     own, inliers = found["cam2_from_cam1"], np.asarray(found["inlier_mask"])
-    parallax = _compared(cameras, (one[inliers], other[inliers]), own).parallax
+    parallax = compared(cameras, (one[inliers], other[inliers]), own).parallax
     if not len(parallax) or np.degrees(np.nanmedian(parallax)) < LEAST_ANGLE_DEG:
         return None
     degrees = float(np.degrees((own.rotation * _other_from_one(model, pair).rotation.inverse()).angle()))
@@ -178,7 +183,7 @@ def strongest(pairs: Sequence[VerifiedPair], *, per_photo: int) -> list[Verified
     return kept
 
 
-def _compared(
+def compared(
     cameras: tuple[pycolmap.Camera, pycolmap.Camera], pixels: tuple[Array, Array], other_from_one: pycolmap.Rigid3d
 ) -> Agreement:
     """Measure how the matches (n, 2) of two photos agree with a relative pose."""
