@@ -30,15 +30,14 @@ assert (torch.get_num_threads(), use_threads()) == (1, 1)
 """,
     "peak memory": """
 import numpy as np
-from nerfcli.bench.measurement import PeakMemory
-memory = PeakMemory("cpu")
-memory.begin()
-before = memory.read()
+from nerfcli.bench.measurement import begin_peak, peak_bytes
+begin_peak("cpu")
+before = peak_bytes("cpu")
 data = np.ones(60_000_000, np.uint8)
-during = memory.read()
+during = peak_bytes("cpu")
 del data
-memory.begin()
-after = memory.read()
+begin_peak("cpu")
+after = peak_bytes("cpu")
 assert before is None or (during - before > 50e6 and during - after > 50e6), (before, during, after)
 """,
 }
