@@ -146,7 +146,9 @@ print(faults, resident, resident_bytes(os.getpid()))
 
 
 def _measured(keep: str) -> list[int]:
-    return [int(number) for number in in_python(_PROGRAM.format(keep=keep)).stdout.split()]
+    ended = in_python(_PROGRAM.format(keep=keep))
+    assert ended.returncode == 0, ended.stderr
+    return [int(number) for number in ended.stdout.split()]
 
 
 def test_freed_memory_is_used_again_without_page_faults_until_it_is_returned():
@@ -162,7 +164,9 @@ def test_freed_memory_is_used_again_without_page_faults_until_it_is_returned():
 def test_the_peak_of_memory_is_not_that_of_the_process_that_started_this_one():
     child = "from nerfcli.machine import peak_resident_bytes; print(peak_resident_bytes())"
     parent = f"import subprocess, sys; kept = b'x' * 2**28; subprocess.run([sys.executable, '-c', {child!r}])"
-    assert int(in_python(parent).stdout) < 2**27
+    ended = in_python(parent)
+    assert ended.stdout, ended.stderr
+    assert int(ended.stdout) < 2**27
 
 
 def _no_library(name: None) -> object:

@@ -9,7 +9,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from queue import SimpleQueue
 from statistics import median
@@ -162,8 +161,9 @@ class Painter:
         # The tiles to come of each client's newest view, as records.
         self._newest: dict[str, Iterator[bytes]] = {}
         self._lock = threading.Lock()
-        # OpenMP keeps a thread count for each calling thread.
-        self._worker = ThreadPoolExecutor(1, initializer=use_threads, initargs=(threads,))
+        self._waiting: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        # Python waits for the threads of an executor when it ends, and not for this one.
+        threading.Thread(target=self._work, args=(threads,), daemon=True).start()
 
     def paint(self, client: str, view: View) -> Iterator[bytes]:
         """Yield the finished tiles of a view: a header of 8 numbers, then three planes of four values per pixel.
@@ -180,11 +180,11 @@ class Painter:
                 record = error
             finished.put(record)
             if isinstance(record, bytes):
-                self._worker.submit(render_one)
+                self._waiting.put(render_one)
 
         with self._lock:
             self._newest[client] = tiles
-        self._worker.submit(render_one)
+        self._waiting.put(render_one)
         try:
             while (record := finished.get()) is not None:
                 if isinstance(record, Exception):
@@ -194,6 +194,11 @@ class Painter:
             with self._lock:
                 if self._newest.get(client) is tiles:
                     del self._newest[client]
+
+    def _work(self, threads: int) -> None:
+        use_threads(threads)  # OpenMP keeps a thread count for each calling thread
+        while True:
+            self._waiting.get()()
 
     def _tiles(self, view: View) -> Iterator[bytes]:
         """Render the tiles of a view, coarse pictures first."""

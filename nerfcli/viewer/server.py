@@ -119,7 +119,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._query = {name: values[-1] for name, values in parse_qs(address.query).items()}
         try:
             places[place]()
-        except UserError as error:  # a browser asks again: a training may write its field soon
+        except UserError as error:  # a browser asks again: a field may be written soon; scripts ignore it
             text = f"{error.message}: {error.hint}\n"
             self._send(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain; charset=utf-8", text, {"Refresh": "2"})
         except ValueError as error:
