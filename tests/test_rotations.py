@@ -112,5 +112,15 @@ def test_a_pair_is_explained_by_about_its_rotation_only(off_deg: float, seen_fro
     assert explains(turn, pair, {1: lens(), 4: lens()}) == fits
 
 
+def test_matches_without_rays_are_explained_by_no_rotation():
+    """A lens with strong distortion has no rays for most pixels; pycolmap's refinement ends the process without any."""
+    lens_without_rays = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 100.0, 800, 600)
+    lens_without_rays.params = [100.0, 400.0, 300.0, -3.0]
+    pair = pair_of(0, 3, np.random.default_rng(0))
+    nowhere = VerifiedPair(1, 4, np.full((40, 2), np.nan), np.full((40, 2), np.nan))
+    assert not explains(pycolmap.Rotation3d(), pair, {1: lens_without_rays, 4: lens_without_rays})
+    assert not explains(pycolmap.Rotation3d(), nowhere, {1: lens(), 4: lens()})
+
+
 def test_without_pairs_there_is_nothing_to_blame():
     assert found([]) == set()

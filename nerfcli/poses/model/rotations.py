@@ -13,9 +13,8 @@ import numpy as np
 import pycolmap
 
 from nerfcli.poses.input.job import Solver
-from nerfcli.poses.model.held_out import MOST_ERROR_PX
 from nerfcli.poses.model.projection import Array
-from nerfcli.poses.model.two_views import VerifiedPair, compared, fitting, rays
+from nerfcli.poses.model.two_views import VerifiedPair, compared, fitting, own_pose, rays
 
 # Rotations of all photos are known if, of all matches, this fraction is in pairs that they fit to within this angle.
 _CONSISTENT, _CONSISTENT_DEG = 0.9, 5.0
@@ -79,11 +78,8 @@ def averaged_rotations(
 
 
 def _own_pose(pair: VerifiedPair, *, cameras: Mapping[int, pycolmap.Camera], seed: int) -> pycolmap.Rigid3d | None:
-    """Estimate the pose of the second camera from the first from the matches of a pair alone."""
-    options = pycolmap.RANSACOptions(max_error=MOST_ERROR_PX, min_num_trials=50, max_num_trials=500, random_seed=seed)
-    one, other = _some(pair)
-    found = pycolmap.estimate_relative_pose(cameras[pair.one], one, cameras[pair.other], other, options=options)
-    return None if found is None else found["cam2_from_cam1"]
+    found = own_pose((cameras[pair.one], cameras[pair.other]), _some(pair), seed=seed)
+    return None if found is None else found[0]
 
 
 def explains(rotation: pycolmap.Rotation3d, pair: VerifiedPair, cameras: Mapping[int, pycolmap.Camera]) -> bool:
@@ -100,10 +96,12 @@ def explains(rotation: pycolmap.Rotation3d, pair: VerifiedPair, cameras: Mapping
         weighted = normals[seen] / np.sqrt(1.0 + (distances / _NOISE) ** 2)[:, None]
         direction = np.linalg.eigh(weighted.T @ weighted)[1][:, 0]
         distances = normals[seen] @ direction
+    near = np.abs(distances) < 5.0 * _NOISE
+    if 2 * near.sum() < len(normals):  # without any, pycolmap's refinement ends the process
+        return False
     start = pycolmap.Rigid3d(rotation, direction)
-    near = (np.abs(distances) < 5.0 * _NOISE)[:, None]
     refined = pycolmap.refine_relative_pose(
-        start, lenses[0], pixels[0][seen], lenses[1], pixels[1][seen], inlier_mask=near
+        start, lenses[0], pixels[0][seen], lenses[1], pixels[1][seen], inlier_mask=near[:, None]
     )
     if refined is None:
         return False

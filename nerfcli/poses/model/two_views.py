@@ -143,20 +143,28 @@ def rotation_errors(
 
 def _rotation_error(model: pycolmap.Reconstruction, pair: VerifiedPair, *, seed: int) -> RotationError | None:
     """Compare a pair's own relative rotation with the model's; None without one, or without parallax."""
-    # The matches are verified; few trials are enough, and pycolmap's own number takes ten times as long.
-    options = pycolmap.RANSACOptions(max_error=MOST_ERROR_PX, min_num_trials=50, max_num_trials=500, random_seed=seed)
     cameras = _cameras(model, pair)
     step = max(1, pair.matches // _MOST_FOR_ROTATION)
     one, other = pair.pixels_one[::step], pair.pixels_other[::step]
-    found = pycolmap.estimate_relative_pose(cameras[0], one, cameras[1], other, options=options)
+    found = own_pose(cameras, (one, other), seed=seed)
     if found is None:
         return None
-    own, inliers = found["cam2_from_cam1"], np.asarray(found["inlier_mask"])
+    own, inliers = found
     parallax = compared(cameras, (one[inliers], other[inliers]), own).parallax
     if not len(parallax) or np.degrees(np.nanmedian(parallax)) < LEAST_ANGLE_DEG:
         return None
     degrees = float(np.degrees((own.rotation * _other_from_one(model, pair).rotation.inverse()).angle()))
     return RotationError(degrees, step * int(inliers.sum()))
+
+
+def own_pose(
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera], pixels: tuple[Array, Array], *, seed: int
+) -> tuple[pycolmap.Rigid3d, NDArray[np.bool_]] | None:
+    """Estimate the transform from the first camera to the second from verified matches alone, and say which agree."""
+    # Few trials are enough for these, and pycolmap's own number takes ten times as long.
+    options = pycolmap.RANSACOptions(max_error=MOST_ERROR_PX, min_num_trials=50, max_num_trials=500, random_seed=seed)
+    found = pycolmap.estimate_relative_pose(cameras[0], pixels[0], cameras[1], pixels[1], options=options)
+    return None if found is None else (found["cam2_from_cam1"], np.asarray(found["inlier_mask"], dtype=bool))
 
 
 def panorama_inliers(
